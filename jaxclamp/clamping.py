@@ -1,0 +1,560 @@
+"""The whole path of the seed: stress-free sectors, load-free, physiological, clamped to the stop."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxclamp.assembly import State, with_equilibrium_pressure
+from jaxclamp.equilibrium import (
+    Equilibrium,
+    EquilibriumError,
+    Held,
+    JawForce,
+    LumenHeight,
+    NotConverged,
+    Path,
+    Step,
+    System,
+    descend,
+    follow,
+    newton,
+    stretched,
+)
+from jaxclamp.linear_solvers import LinearSolver
+from jaxclamp.measures import PARTS_OF_A_JAW, PEAK_SHARPNESS, observe
+from jaxclamp.meshes import closed_positions
+from jaxclamp.model import SYMMETRY, Model, build_model, terms
+from jaxclamp.scene import ForceStop, OcclusionStop, Scene, TravelStop
+
+FIRST_TOUCH = 0.02
+"""the first closing step, as part of the outer radius: enough to bring points into contact"""
+NEARLY_CLOSED = 0.99
+"""a force stop is sought up to this occlusion"""
+SMALLEST_SHARE = 1 / 16
+"""a neighbour's solution is followed in steps of at least this share of the way, or given up"""
+RESCUE_MOVE = 0.02
+"""jaw move of a descent, as part of the outer radius"""
+MAX_RESCUES = 60
+LOAD_STEP = 0.3
+"""first step of pressure and stretch, as part of the whole"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """One converged state and what was read off it."""
+
+    stage: str
+    equilibrium: Equilibrium
+    values: dict[str, Any]
+    """as in result.json: floats, and one dict per layer for peaks"""
+
+    @property
+    def state(self) -> State:
+        """Positions, pressures and jaw height."""
+        return self.equilibrium.state
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """Where a clamping stands."""
+
+    stage: str
+    fraction: float
+    message: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """Every converged state of a clamping."""
+
+    model: Model
+    states: tuple[Kept, ...]
+    """load-free, physiological, then closing, in order"""
+    failure: EquilibriumError | None
+    solver: dict[str, Any]
+    cost: dict[str, Any]
+
+    @property
+    def scene(self) -> Scene:
+        return self.model.scene
+
+    @property
+    def converged(self) -> bool:
+        """True if the stop was reached."""
+        return self.failure is None
+
+    def _stage(self, stage: str) -> list[Kept]:
+        return [kept for kept in self.states if kept.stage == stage]
+
+    @property
+    def load_free(self) -> Kept | None:
+        return next(iter(self._stage("load-free")), None)
+
+    @property
+    def physiological(self) -> Kept | None:
+        return next(iter(self._stage("physiological")), None)
+
+    @property
+    def closing(self) -> list[Kept]:
+        """The physiological state and all states with the jaws on the artery."""
+        return self._stage("physiological") + self._stage("clamping")
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """One record per converged state from the physiological one on."""
+        return [self._relative(kept) for kept in self.closing]
+
+    @property
+    def final(self) -> dict[str, Any]:
+        """The record of the last converged state; None everywhere if there is none with the jaws closing."""
+        return self.history[-1] if self.history else {}
+
+    def _relative(self, kept: Kept) -> dict[str, Any]:
+        """A state's record, with the quantities that refer to the physiological state."""
+        assert self.physiological is not None
+        base, v = self.physiological.values, kept.values
+        travel = max(base["outer_radius_mm"] - v["jaw_height_mm"], 0.0) if kept.stage == "clamping" else 0.0
+        relative = {
+            "stage": kept.stage,
+            "jaw_travel_mm": travel,
+            "occlusion": 1.0 - v["lumen_height_mm"] / base["lumen_height_mm"],
+            "area_occlusion": 1.0 - v["lumen_area_mm2"] / base["lumen_area_mm2"],
+            "axial_stress_ratio_at_P": _ratio(v["axial_stress_at_P_kPa"], base["axial_stress_at_P_kPa"]),
+            "circumferential_stress_ratio_at_P": _ratio(
+                v["circumferential_stress_at_P_kPa"], base["circumferential_stress_at_P_kPa"]
+            ),
+            "negative_pivots": kept.equilibrium.negative_pivots,
+            "snapped": kept.equilibrium.snapped,
+            "newton_iterations": kept.equilibrium.iterations,
+        }
+        return relative | {key: value for key, value in v.items() if key != "jaw_height_mm"}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of result.json."""
+        scene = self.scene
+        load_free, base = self.load_free, self.physiological
+        return {
+            "title": scene.title,
+            "converged": self.converged,
+            "failure": None if self.failure is None else str(self.failure),
+            "load_free": {
+                "lumen_radius_mm": _radius(load_free),
+                "outer_radius_mm": load_free and load_free.values["outer_radius_mm"],
+            },
+            "physiological": {
+                "lumen_radius_mm": _radius(base),
+                "outer_radius_mm": base and base.values["outer_radius_mm"],
+                "axial_stress_at_P_kPa": base and base.values["axial_stress_at_P_kPa"],
+                "circumferential_stress_at_P_kPa": base and base.values["circumferential_stress_at_P_kPa"],
+            },
+            "final": self.final,
+            "history": self.history,
+            "model": {
+                "symmetry": SYMMETRY,
+                "elements": self.model.mesh.n_cells,
+                "element": scene.mesh.element,
+                "unknowns": self.model.pattern.n,
+                "terms": terms(scene),
+                "peak_sharpness": PEAK_SHARPNESS,
+            },
+            "solver": self.solver,
+            "cost": self.cost,
+            "versions": versions(),
+        }
+
+
+def _radius(kept: Kept | None) -> float | None:
+    return None if kept is None else 0.5 * kept.values["lumen_height_mm"]
+
+
+def _ratio(value: float, base: float) -> float | None:
+    return value / base if base != 0.0 else None
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    names = ("jaxclamp", "jax", "jaxlib", "numpy", "scipy")
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+class _Walk:
+    """One clamping under way: the system, what has converged so far, and whom to tell."""
+
+    def __init__(self, model: Model, report: Callable[[Progress], None]) -> None:
+        self.model, self.report = model, report
+        self.states: list[Kept] = []
+        self.start = time.perf_counter()
+        self.compile_seconds = 0.0
+        settings = model.scene.solver
+        self.system = System(
+            body=model.body,
+            solver=LinearSolver(model.pattern, settings.linear_solver),
+            tolerance=settings.tolerance,
+            length=1.0,
+            diagonal=model.pattern.indptr[:-1],
+        )
+
+    def keep(self, stage: str, equilibrium: Equilibrium, fraction: float, message: str) -> None:
+        """Read a converged state off, remember it, and report progress."""
+        values = observe(
+            self.model.body, equilibrium.state, jnp.asarray(equilibrium.pressure), self.model.marks
+        )
+        self.states.append(Kept(stage, equilibrium, _to_floats(values)))
+        self.report(Progress(stage, fraction, message))
+
+    # --- the three stages -----------------------------------------------------------------------
+
+    def load_free(self, guess: State | None) -> Equilibrium:
+        """Close the open sectors: no pressure, no stretch, the jaw far away."""
+        self.report(Progress("load-free", 0.0, "closing the open sectors"))
+        scene, model = self.model.scene, self.model
+        far = jnp.asarray(self.far)
+        x = closed_positions(model.mesh, scene.mesh, scene.artery) if guess is None else guess.x
+        self.system.length = float(jnp.max(x[:, 1]))
+        start = with_equilibrium_pressure(model.body, x, far) if guess is None else guess
+        step = Step(Held(self.far), 0.0, 1.0)
+        equilibrium = self.solve_or_descend("load-free", start, step, "no load")
+        self.system.length = float(equilibrium.state.x[model.marks.lumen_top, 1])
+        radius = self.system.length
+        self.keep("load-free", equilibrium, 1.0, f"lumen radius {radius:.3f} mm")
+        return equilibrium
+
+    def physiological(self, load_free: Equilibrium, guess: State | None) -> Equilibrium:
+        """Stretch and inflate."""
+        artery = self.model.scene.artery
+        pressure, stretch = float(artery.pressure), float(artery.axial_stretch)
+        path: Path = lambda s: Step(Held(self.far), s * pressure, 1.0 + s * (stretch - 1.0))  # noqa: E731
+        tell = lambda s, e: self.report(  # noqa: E731
+            Progress("physiological", s, f"{e.pressure:.2f} kPa, axial stretch {e.axial_stretch:.3f}")
+        )
+        equilibrium = None
+        if guess is not None:
+            guess = stretched(guess, stretch * self.model.half_length)
+            try:
+                equilibrium = newton(self.system, guess, pressure, stretch, Held(self.far))
+            except NotConverged:
+                equilibrium = None
+        if equilibrium is None:
+            equilibrium = self.walk("physiological", load_free, path, tell, lambda e: False, LOAD_STEP)
+        self.system.length = float(equilibrium.state.x[self.model.marks.lumen_top, 1])
+        self.keep("physiological", equilibrium, 1.0, f"lumen radius {self.system.length:.3f} mm")
+        return equilibrium
+
+    def close(self, physiological: Equilibrium) -> Equilibrium:
+        """Move the jaw on until the stop."""
+        scene = self.model.scene
+        self.refer_to(physiological)
+        stop = scene.stop
+        if isinstance(stop, TravelStop) and float(stop.travel) <= FIRST_TOUCH * self.outer_radius:
+            touch = self.outer_radius - float(stop.travel)
+        else:
+            touch = (1.0 - FIRST_TOUCH) * self.outer_radius
+        start = dataclasses.replace(physiological.state, jaw_height=jnp.asarray(touch))
+        equilibrium = self.solve_or_descend(
+            "clamping", start, self.held(touch), f"first contact, jaw height {touch:.3f} mm"
+        )
+        self.keep("clamping", equilibrium, 0.0, "first contact")
+        for _ in range(MAX_RESCUES):
+            path, reached = self.next_path(equilibrium)
+            if path is None:
+                return equilibrium
+            equilibrium = self.walk("clamping", equilibrium, path, self.tell_closing, reached)
+        raise self.error("clamping", equilibrium, NotConverged("the stop was not reached"))
+
+    def next_path(self, now: Equilibrium) -> tuple[Path | None, Callable[[Equilibrium], bool]]:
+        """The load path from here towards the stop, and where to leave it early; None at the stop."""
+        scene = self.model.scene
+        stop, by_travel = scene.stop, scene.solver.continuation == "travel"
+        height, jaw = self.top(now), float(now.state.jaw_height)
+        never = lambda e: False  # noqa: E731
+        if isinstance(stop, TravelStop):
+            target = self.outer_radius - float(stop.travel)
+            if abs(jaw - target) <= 1e-12 * self.outer_radius:
+                return None, never
+            return (lambda s: self.held(jaw + s * (target - jaw))), never
+        if isinstance(stop, OcclusionStop):
+            target = (1.0 - float(stop.occlusion)) * self.lumen_radius
+            if abs(height - target) <= 1e-8 * self.lumen_radius:
+                return None, never
+            if by_travel and height > target + 0.05 * self.lumen_radius:
+                lowest = jaw - (height - target)
+                return (
+                    lambda s: self.held(jaw + s * (lowest - jaw)),
+                    lambda e: self.top(e) < target + 0.05 * self.lumen_radius,
+                )
+            return (lambda s: self.lumen(height + s * (target - height))), never
+        assert isinstance(stop, ForceStop)
+        wanted, force = float(stop.force) / PARTS_OF_A_JAW, float(now.lin.jaw_force)
+        if abs(force - wanted) <= 1e-6 * wanted:
+            return None, never
+        if force > 0.7 * wanted:
+            scale = abs(now.force_slope) or 1.0
+            condition = lambda s: JawForce(force + s * (wanted - force), scale)  # noqa: E731
+            return (lambda s: self.step(condition(s))), never
+        target = (1.0 - NEARLY_CLOSED) * self.lumen_radius
+        if height <= target:
+            reason = f"{force * PARTS_OF_A_JAW * 1e-3:.3g} N is all it takes to {NEARLY_CLOSED:.0%} occlusion"
+            raise self.error("clamping", now, NotConverged(reason))
+        return (lambda s: self.lumen(height + s * (target - height))), lambda e: (
+            float(e.lin.jaw_force) > 0.7 * wanted
+        )
+
+    # --- pieces ---------------------------------------------------------------------------------
+
+    @property
+    def far(self) -> float:
+        """A jaw height well clear of any artery the scene can make, mm."""
+        return 1e3 * float(self.model.scene.artery.layers[-1].inner_radius)
+
+    def use(self, model: Model) -> None:
+        """Compute with another scene of the same static choices."""
+        self.model = model
+        self.system.body = model.body
+
+    def refer_to(self, physiological: Equilibrium) -> None:
+        """Take the radii that stops and travels refer to, mm."""
+        self.lumen_radius = float(physiological.state.x[self.model.marks.lumen_top, 1])
+        self.outer_radius = float(physiological.state.x[self.model.marks.outer_top, 1])
+
+    def step(self, closing: Held | LumenHeight | JawForce) -> Step:
+        artery = self.model.scene.artery
+        return Step(closing, float(artery.pressure), float(artery.axial_stretch))
+
+    def held(self, height: float) -> Step:
+        return self.step(Held(height))
+
+    def lumen(self, height: float) -> Step:
+        coordinate = 3 * self.model.marks.lumen_top + 1
+        unknown = int(np.searchsorted(np.asarray(self.model.body.topology.free), coordinate))
+        return self.step(LumenHeight(height, unknown, coordinate))
+
+    def top(self, equilibrium: Equilibrium) -> float:
+        """Half the lumen height, mm."""
+        return float(equilibrium.state.x[self.model.marks.lumen_top, 1])
+
+    def tell_closing(self, s: float, equilibrium: Equilibrium) -> None:
+        occlusion = 1.0 - self.top(equilibrium) / self.lumen_radius
+        force = float(equilibrium.lin.jaw_force) * PARTS_OF_A_JAW * 1e-3
+        note = ", snapped" if equilibrium.snapped else ""
+        message = f"occlusion {occlusion:.1%}, jaw force {force:.3f} N{note}"
+        self.keep("clamping", equilibrium, self.closed_fraction(equilibrium), message)
+
+    def closed_fraction(self, equilibrium: Equilibrium) -> float:
+        stop = self.model.scene.stop
+        if isinstance(stop, OcclusionStop):
+            return (1.0 - self.top(equilibrium) / self.lumen_radius) / float(stop.occlusion)
+        if isinstance(stop, TravelStop):
+            return (self.outer_radius - float(equilibrium.state.jaw_height)) / float(stop.travel)
+        return float(equilibrium.lin.jaw_force) * PARTS_OF_A_JAW / float(stop.force)
+
+    def walk(
+        self,
+        stage: str,
+        start: Equilibrium,
+        path: Path,
+        tell: Callable[[float, Equilibrium], None],
+        reached: Callable[[Equilibrium], bool],
+        first_step: float | None = None,
+    ) -> Equilibrium:
+        """Follow a path; where Newton fails, take one step downhill at a held jaw and return."""
+        options = {} if first_step is None else {"first_step": first_step}
+        s, equilibrium, failure = follow(
+            self.system, start, path, self.model.half_length, tell, reached, **options
+        )
+        if failure is None:
+            return equilibrium
+        if stage != "clamping":
+            raise self.error(stage, equilibrium, failure)
+        move = RESCUE_MOVE * self.outer_radius
+        while move > 1e-3 * RESCUE_MOVE * self.outer_radius:
+            height = float(equilibrium.state.jaw_height) - move
+            step = self.held(height)
+            try:
+                found = descend(self.system, equilibrium.state, step)
+            except NotConverged as error:
+                failure, move = error, 0.5 * move
+                continue
+            tell(s, found)
+            return found
+        raise self.error(stage, equilibrium, failure)
+
+    def solve_or_descend(self, stage: str, start: State, step: Step, load: str) -> Equilibrium:
+        """Newton, and if that fails the way downhill."""
+        try:
+            return newton(self.system, start, step.pressure, step.axial_stretch, step.closing)
+        except NotConverged:
+            try:
+                return descend(self.system, start, step)
+            except NotConverged as error:
+                raise EquilibriumError(
+                    stage, load, error.residual, error.J_min, f"{error}; {_ADVICE[stage]}"
+                ) from error
+
+    def error(self, stage: str, last: Equilibrium, failure: NotConverged) -> EquilibriumError:
+        """The sentence for a user, with the last load that did converge."""
+        if stage == "clamping":
+            occlusion = 1.0 - self.top(last) / self.lumen_radius
+            load = f"occlusion {occlusion:.1%}, jaw height {float(last.state.jaw_height):.4f} mm"
+        else:
+            load = f"pressure {last.pressure:.4g} kPa, axial stretch {last.axial_stretch:.4g}"
+        return EquilibriumError(
+            stage, "the step after " + load, failure.residual, failure.J_min, f"{failure}; {_ADVICE[stage]}"
+        )
+
+
+_ADVICE = {
+    "load-free": "check radii, thicknesses and opening angles of the layers",
+    "physiological": "check pressure and axial stretch against the stiffness of the wall, or refine the mesh",
+    "clamping": "round the jaw's edges, refine the mesh under them, or stop earlier",
+}
+
+
+def _to_floats(values: Any) -> Any:
+    """Host floats (lists for vectors) of a nested dict of arrays."""
+    return jax.tree_util.tree_map(lambda leaf: np.asarray(leaf).tolist(), jax.device_get(values))
+
+
+def _reporter(progress: bool | Callable[[Progress], None] | None) -> Callable[[Progress], None]:
+    if callable(progress):
+        return progress
+    if progress:
+        return lambda event: print(f"{event.stage:14s} {event.fraction:4.0%}  {event.message}", file=sys.stderr)
+    return lambda event: None
+
+
+def clamp(
+    scene: Scene,
+    *,
+    guess: Result | None = None,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> Result:
+    """Clamp the artery of a scene to its stop; every converged state.
+
+    guess: the result of a neighbouring scene (same mesh and laws) to start from
+    progress: True for lines on standard error, or a function of `Progress`
+
+    Raises EquilibriumError if the stop is not reached; its `result` keeps what did converge.
+    """
+    like = None if guess is None else guess.model
+    model = build_model(scene, like)
+    walk = _Walk(model, _reporter(progress))
+    warm = guess if guess is not None and guess.converged and model.mesh is guess.model.mesh else None
+    try:
+        if warm is not None and _warm(walk, warm):
+            return _result(walk, None)
+        walk.states.clear()
+        walk.close(walk.physiological(walk.load_free(None), None))
+    except EquilibriumError as error:
+        error.result = _result(walk, error)
+        raise
+    return _result(walk, None)
+
+
+def _warm(walk: _Walk, guess: Result) -> bool:
+    """Solve from a neighbour's states, over scenes in between if the way is long.
+
+    False if that does not work and a cold start is needed.
+    """
+    target = walk.model
+    load_free, base, last = (
+        kept.equilibrium for kept in (guess.load_free, guess.physiological, guess.states[-1]) if kept
+    )
+    reached, step = 0.0, 1.0
+    while reached < 1.0:
+        t = min(1.0, reached + step)
+        walk.use(target if t == 1.0 else build_model(between(guess.scene, target.scene, t), target))
+        walk.states.clear()
+        try:
+            new_load_free = walk.load_free(load_free.state) if t == 1.0 else load_free
+            new_base = walk.physiological(new_load_free, base.state)
+            walk.refer_to(new_base)
+            closing = _closing_at_stop(walk, last)
+            start = stretched(last.state, new_base.axial_stretch * walk.model.half_length)
+            found = newton(walk.system, start, new_base.pressure, new_base.axial_stretch, closing)
+        except (NotConverged, EquilibriumError):
+            step = 0.5 * step
+            if step < SMALLEST_SHARE:
+                walk.use(target)
+                return False
+            continue
+        reached, load_free, base, last = t, new_load_free, new_base, found
+    walk.keep("clamping", last, 1.0, "from a neighbouring solution")
+    return True
+
+
+def between(a: Scene, b: Scene, t: float) -> Scene:
+    """The scene whose floats lie at the share t of the way from a to b."""
+    return jax.tree_util.tree_map(lambda u, v: u + t * (v - u), a, b)
+
+
+def _closing_at_stop(walk: _Walk, near: Equilibrium) -> Held | LumenHeight | JawForce:
+    """The condition that the stop puts on the final state."""
+    stop = walk.model.scene.stop
+    if isinstance(stop, OcclusionStop):
+        return walk.lumen((1.0 - float(stop.occlusion)) * walk.lumen_radius).closing
+    if isinstance(stop, TravelStop):
+        return Held(walk.outer_radius - float(stop.travel))
+    return JawForce(float(stop.force) / PARTS_OF_A_JAW, abs(near.force_slope) or 1.0)
+
+
+def _result(walk: _Walk, failure: EquilibriumError | None) -> Result:
+    system, states = walk.system, tuple(walk.states)
+    last = states[-1].values if states else {}
+    solver = {
+        "linear_solver": system.solver.name,
+        "load_steps": system.load_steps,
+        "newton_iterations": system.newton_iterations,
+        "factorisations": system.solver.factorisations,
+        "residual_mN": last.get("residual_mN"),
+        "force_balance_error": last.get("force_balance_error"),
+        "work_balance_error": _work_balance(list(_closing_states(states))),
+        "snapped": any(kept.equilibrium.snapped for kept in states),
+        "negative_pivots": states[-1].equilibrium.negative_pivots if states else None,
+    }
+    cost = {
+        "wall_s": time.perf_counter() - walk.start,
+        "compile_s": system.compile_seconds,
+        "assembly_s": system.assembly_seconds,
+        "factor_s": system.solver.factor_seconds,
+        "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+    }
+    return Result(walk.model, states, failure, solver, cost)
+
+
+def _closing_states(states: tuple[Kept, ...]) -> Iterator[Kept]:
+    return (kept for kept in states if kept.stage == "clamping")
+
+
+def _work_balance(closing: list[Kept]) -> float | None:
+    """Work of the jaws against the change of total energy over the closing, relative.
+
+    Between two states the force is integrated over the travel with its slopes at both ends
+    (Hermite, fourth order): W = h/2 (F0 + F1) + h**2/12 (F0' - F1').
+    """
+    if len(closing) < 3:
+        return None
+    work = 0.0
+    for a, b in zip(closing[:-1], closing[1:], strict=True):
+        down = float(a.state.jaw_height) - float(b.state.jaw_height)
+        forces = [float(k.equilibrium.lin.jaw_force) for k in (a, b)]
+        slopes = [-k.equilibrium.force_slope for k in (a, b)]
+        work += down / 2.0 * sum(forces) + down**2 / 12.0 * (slopes[0] - slopes[1])
+    change = float(closing[-1].equilibrium.lin.energy) - float(closing[0].equilibrium.lin.energy)
+    return abs(work - change) / max(abs(change), 1e-12)

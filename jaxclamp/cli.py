@@ -1,0 +1,243 @@
+"""The command line: `jaxclamp show`, `run` and `presets`.
+
+Exit codes: 0 done; 2 the input is wrong; 3 no converged solution; 4 the machine refused; 130
+interrupted. What went wrong is one sentence on standard error. Results go to standard output,
+progress and notes to standard error. Only what a command needs is imported, when it runs.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from jaxclamp import console
+from jaxclamp.presets import KINDS, SceneError, preset
+from jaxclamp.presets import presets as shipped
+
+if TYPE_CHECKING:
+    from jaxclamp.scene import Scene
+
+DONE, WRONG_INPUT, NOT_CONVERGED, MACHINE_REFUSED, INTERRUPTED = 0, 2, 3, 4, 130
+
+app = typer.Typer(
+    help="Clamping of arteries by finite elements: stress-free, load-free, physiological, clamped.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="A TOML file or the name of a preset.")]
+FidelityOption = Annotated[
+    str | None,
+    typer.Option(
+        "--fidelity",
+        metavar="draft|standard|reference",
+        help="The mesh, where the scene has none of its own.",
+        show_default="standard",
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Override one key, e.g. clamp.jaw.radius_mm=1.5; repeatable."
+    ),
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="./SCENE-result"),
+]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+    try:
+        code = app(
+            args=None if arguments is None else list(arguments), prog_name="jaxclamp", standalone_mode=False
+        )
+        sys.stdout.flush()
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    except (BrokenPipeError, SystemExit):  # the reader of our output has gone; typer exits for that
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except Exception as error:
+        known = _refusal(error)
+        if known is None:
+            raise
+        return _fail(*known)
+    if code == INTERRUPTED:
+        return _fail("interrupted", INTERRUPTED)
+    return code or DONE
+
+
+def _fail(sentence: str, code: int) -> int:
+    if sentence:
+        typer.echo(f"jaxclamp: {' '.join(sentence.split())}", err=True)
+    return code
+
+
+def _refusal(error: Exception) -> tuple[str, int] | None:
+    """Sentence and exit code of an error that is not a mistake of this program."""
+    if isinstance(error, SceneError):
+        return str(error), WRONG_INPUT
+    if (usage := getattr(error, "format_message", None)) is not None:  # of the command itself
+        return usage(), WRONG_INPUT
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        return (
+            "not enough memory: take a coarser mesh (--fidelity draft, or fewer mesh elements)",
+            MACHINE_REFUSED,
+        )
+    if isinstance(error, OSError):
+        where = f" {error.filename}" if error.filename else ""
+        return f"the machine refused{where}: {error.strerror or error}", MACHINE_REFUSED
+    return None
+
+
+# ---------------------------------------------------------------------------------- commands
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import PackageNotFoundError, version
+
+        with suppress(PackageNotFoundError):  # run from a copy of the sources
+            typer.echo(f"jaxclamp {version('jaxclamp')}")
+        raise typer.Exit
+
+
+@app.callback()
+def top(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def show(
+    scene: SceneArgument,
+    fidelity: FidelityOption = None,
+    overrides: SetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a scene and say what would be modelled; solves nothing."""
+    loaded = _load(scene, fidelity, overrides, quiet=False)
+    from jaxclamp.clamping import describe
+
+    described = describe(loaded)
+    if as_json:
+        typer.echo(console.as_json(described))
+    else:
+        typer.echo(loaded.title or scene)
+        typer.echo("\n".join(console.lines(described)))
+
+
+@app.command()
+def run(
+    scene: SceneArgument,
+    out: OutOption = None,
+    fidelity: FidelityOption = None,
+    overrides: SetOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Clamp an artery: stress-free, load-free, physiological, clamped to the stop."""
+    loaded = _load(scene, fidelity, overrides, quiet)
+    folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-result")
+    if folder is not None:
+        _check_folder(folder)
+    result, failure = _solve(loaded, quiet)
+    files = _write(result, folder) if result is not None and folder is not None else []
+    if result is not None and as_json:
+        typer.echo(console.as_json(result.to_dict()))
+    elif result is not None and not quiet:
+        typer.echo("\n".join(console.summary(result.to_dict(), files)))
+    if failure is not None:
+        kept = f" (the states that converged are in {folder})" if files else ""
+        return _fail(f"{failure}{kept}", NOT_CONVERGED)
+    return DONE
+
+
+@app.command()
+def presets(
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Print the TOML of this one.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List what ships: scenes, arteries and jaws; or print one of them."""
+    if name is not None:
+        typer.echo(preset(name).text, nl=False)
+        return
+    known = shipped()
+    if as_json:
+        typer.echo(console.as_json([{"kind": p.kind, "name": p.name, "title": p.title} for p in known]))
+        return
+    width = max(len(each.name) for each in known)
+    for each in known:
+        typer.echo(f"{each.kind:<{max(map(len, KINDS))}}  {each.name:<{width}}  {each.title}")
+
+
+# ---------------------------------------------------------------------------------- steps of run
+
+
+def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:
+    from jaxclamp.scene_file import load_scene, own_mesh_keys
+
+    loaded = load_scene(scene, overrides or (), fidelity or "standard")
+    if fidelity is not None and not quiet and (own := own_mesh_keys(scene)):
+        keys = ", ".join(f"mesh.{key}" for key in own)
+        typer.echo(f"note: {scene} sets {keys} itself; --fidelity {fidelity} leaves that as it is", err=True)
+    return loaded
+
+
+def _check_folder(folder: Path) -> None:
+    """Refuse a folder in which no file can be written; leaves nothing behind."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        finally:
+            for path in missing:
+                with suppress(OSError):
+                    path.rmdir()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise typer.BadParameter(
+            f"no files can be written in {str(folder)!r}: {reason}", param_hint="--out"
+        ) from None
+
+
+def _solve(scene: Scene, quiet: bool) -> tuple[Any, Exception | None]:
+    """The result (None if there is nothing to keep), and why it does not reach the stop."""
+    from jaxclamp.clamping import clamp
+    from jaxclamp.equilibrium import EquilibriumError
+
+    try:
+        with console.progress(quiet) as progress:
+            result = clamp(scene, progress=progress)
+    except EquilibriumError as error:
+        return error.result, error
+    return result, None if result.converged else result.failure
+
+
+def _write(result: Any, folder: Path) -> list[Path]:
+    from jaxclamp.export import write_outputs
+
+    return list(write_outputs(result, folder))

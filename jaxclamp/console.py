@@ -1,0 +1,143 @@
+"""What the command line says: progress while it works, figures and files when it is done."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+# block of result.json and the keys of it that a summary shows
+FIGURES = {
+    "physiological": ("lumen_radius_mm", "axial_stress_at_P_kPa", "circumferential_stress_at_P_kPa"),
+    "final": (
+        "occlusion",
+        "area_occlusion",
+        "jaw_travel_mm",
+        "lumen_height_mm",
+        "lumen_width_mm",
+        "clamp_force_N",
+        "max_contact_pressure_kPa",
+        "max_penetration_mm",
+        "axial_stress_at_P_kPa",
+        "axial_stress_ratio_at_P",
+        "circumferential_stress_ratio_at_P",
+        "peak_axial_stress_kPa",
+    ),
+}
+UNITS = {"mm": "mm", "mm2": "mm2", "kPa": "kPa", "N": "N", "mN": "mN", "s": "s", "seconds": "s", "MB": "MB"}
+OPEN_FIRST = (".html", ".pvd", ".xdmf", ".csv", ".json")
+"""files that a reader opens, the report first; pictures and the states' own files are found there"""
+
+
+@contextmanager
+def progress(quiet: bool) -> Iterator[Callable[[Any], None] | bool]:
+    """A receiver of progress events (`stage`, `fraction` of the stage, `message`).
+
+    A bar on a terminal, plain lines elsewhere, both on standard error; False if quiet.
+    """
+    if quiet:
+        yield False
+    elif not sys.stderr.isatty():
+        yield PlainLines()
+    else:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+        stage, said = TextColumn("{task.description:<14}"), TextColumn("{task.fields[said]}", markup=False)
+        columns = (stage, BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), said)
+        with Progress(*columns, console=Console(stderr=True)) as bars:
+            tasks: dict[str, Any] = {}
+
+            def draw(event: Any) -> None:
+                if event.stage not in tasks:
+                    tasks[event.stage] = bars.add_task(event.stage, total=1.0, said="")
+                bars.update(tasks[event.stage], completed=event.fraction, said=event.message)
+
+            yield draw
+
+
+class PlainLines:
+    """A line on standard error for each stage, each further twentieth of it, and its end."""
+
+    def __init__(self) -> None:
+        self.stage, self.fraction = "", 0.0
+
+    def __call__(self, event: Any) -> None:
+        gained = event.fraction - self.fraction
+        finished = event.fraction >= 1.0 and gained > 0.0
+        if event.stage == self.stage and gained < 0.05 and not finished:
+            return
+        self.stage, self.fraction = event.stage, event.fraction
+        sys.stderr.write(f"{event.stage}: {event.fraction:4.0%}  {event.message}".rstrip() + "\n")
+        sys.stderr.flush()
+
+
+def summary(result: dict[str, Any], files: list[Path]) -> list[str]:
+    """The key figures of a result, and the files to open, as lines."""
+    done = "" if result.get("converged") else " (NOT CONVERGED: the last state that did)"
+    output = [f"{result.get('title') or 'Clamping'}{done}"]
+    for block, keys in FIGURES.items():
+        output += ["", f"  {block}"]
+        for key in keys:
+            value = (result.get(block) or {}).get(key)
+            parts = value if isinstance(value, dict) else {"": value}
+            for layer, number in parts.items():
+                label, unit = label_and_unit(key)
+                output.append(
+                    f"    {f'{label}, {layer}' if layer else label:<36}{figure(number):>10} {unit}".rstrip()
+                )
+    to_open = sorted((f for f in files if f.suffix in OPEN_FIRST), key=lambda f: OPEN_FIRST.index(f.suffix))
+    return output + ["", *(f"  open {path}" for path in to_open)] if to_open else output
+
+
+def label_and_unit(key: str) -> tuple[str, str]:
+    """'lumen_height_mm' -> ('lumen height', 'mm')."""
+    name, _, unit = key.rpartition("_")
+    return (name.replace("_", " "), UNITS[unit]) if name and unit in UNITS else (key.replace("_", " "), "")
+
+
+def figure(value: Any) -> str:
+    """A number to four digits, '-' for none."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "-" if value is None else str(value)
+
+
+def lines(described: dict[str, Any], indent: str = "  ") -> list[str]:
+    """A nested description as indented lines; what is empty is left out."""
+    output: list[str] = []
+    for key, value in described.items():
+        label, unit = label_and_unit(str(key))
+        if isinstance(value, dict):
+            output += [f"{indent}{label}", *lines(value, indent + "  ")]
+        elif isinstance(value, list | tuple):
+            output += (
+                [f"{indent}{label}", *(f"{indent}  {one_line(item)}" for item in value)] if value else []
+            )
+        else:
+            output.append(f"{indent}{label}: {figure(value)} {unit}".rstrip())
+    return output
+
+
+def one_line(item: Any) -> str:
+    """An item of a list on one line."""
+    if isinstance(item, dict):
+        return ", ".join(text.strip() for text in lines(item))
+    return ": ".join(map(figure, item)) if isinstance(item, list | tuple) else figure(item)
+
+
+def as_json(content: Any) -> str:
+    """JSON text, with null for the numbers that JSON does not have."""
+    return json.dumps(_finite(content), indent=2, allow_nan=False)
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content

@@ -1,0 +1,183 @@
+"""The one place where materials, jaw and contact law meet the mesh: densities at points.
+
+The potential of the modelled eighth is
+
+    Pi(x, p; d) = sum_cells int [psi_bar(F) + p (J - 1)] dV - 1/2 p' M p     (wall)
+                  - pressure * V_lumen(x) + int phi(gap(x; d)) dA            (blood, jaws)
+
+with one or four pressures p per cell and M = int N_m N_n / bulk dV, so that at equilibrium
+p = bulk (J - 1) averaged over the cell (mean dilatation, Q1/P0) or projected on the linear
+functions (Q2/P1); d is the height of the jaw's lowest point above the artery's axis.
+
+Everything is written over points with the batch axes (n_q points per cell, n_cells) last.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxclamp.contact import Contact
+from jaxclamp.elements import lagrange, tensor_rule
+from jaxclamp.jaws import Jaw
+from jaxclamp.materials import Material
+from jaxclamp.meshes import Mesh, stress_free_positions
+from jaxclamp.pytree import record, shape_of
+from jaxclamp.scene import Artery, MeshSettings
+from jaxclamp.tensors import Tensor, Vector, cross, det, inverse, norm, product, stacked, transpose
+
+
+@record
+class Parameters:
+    """What the densities need to know of the scene, beside the geometry."""
+
+    materials: tuple[Material, ...]
+    contact: Contact
+    jaw: Jaw
+
+
+@record
+class Stencils:
+    """Shape functions at the quadrature points: the same numbers for every cell."""
+
+    wall: np.ndarray
+    """dN/dxi, (n_q, 3, n_en)"""
+    modes: np.ndarray
+    """pressure modes, (n_m, n_q)"""
+    lumen: np.ndarray
+    """N, dN/deta, dN/dzeta at the points of a facet, (n_fq, 3, n_fn)"""
+    contact: np.ndarray
+    """N at the contact points of a facet, (n_cq, 1, n_fn)"""
+
+
+@record
+class Geometry:
+    """The stress-free artery, seen from the quadrature points."""
+
+    to_local: Array
+    """d xi / d X in material axes: F = dx/dxi @ to_local, (3, 3, n_q, n_cells)"""
+    dV: Array
+    """stress-free volume of a point, mm^3, (n_q, n_cells)"""
+    dA: Array
+    """stress-free outer area of a contact point, mm^2, (n_cq, n_facets)"""
+    pressure_stiffness: Array
+    """inverse of M, kPa/mm^3, (n_m, n_m, n_cells)"""
+
+
+def build_stencils(mesh: Mesh, settings: MeshSettings) -> Stencils:
+    """Shape functions at the points of the cells and of the inner and outer facets."""
+    element = mesh.element
+    points, _ = element.quadrature()
+    facet_points, _ = tensor_rule((element.points_per_axis,) * 2)
+    contact_points, _ = tensor_rule((settings.contact_points,) * 2)
+    N, dN = lagrange(element.nodes_1d, facet_points)
+    return Stencils(
+        wall=element.shape(points)[1],
+        modes=element.pressure_modes(points),
+        lumen=np.concatenate([N[:, None], dN], axis=1),
+        contact=lagrange(element.nodes_1d, contact_points)[0][:, None],
+    )
+
+
+@jax.jit
+def build_geometry(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Geometry:
+    """Jacobians, volumes and areas of the stress-free artery; differentiable in every float."""
+    element = mesh.element
+    points, weights = element.quadrature()
+    N, dN = element.shape(points)
+    X = stress_free_positions(mesh, settings, artery)
+    axes = jnp.moveaxis(_cylindrical_axes(jnp.einsum("qa,iac->iqc", N, X)), 0, 1)  # columns
+    jacobian = jnp.einsum("qka,iac->ikqc", dN, X)
+    dV = det(jacobian) * weights[:, None]
+    bulk = jnp.concatenate(
+        [
+            jnp.full(last - first, layer.material.bulk)
+            for layer, (first, last) in zip(artery.layers, mesh.layer_cells, strict=True)
+        ]
+    )
+    modes = element.pressure_modes(points)
+    M = jnp.einsum("mq,nq,qc->cmn", modes, modes, dV) / bulk[:, None, None]
+
+    facet_points, facet_weights = tensor_rule((settings.contact_points,) * 2)
+    _, dN_facet = lagrange(element.nodes_1d, facet_points)
+    outer_layer = X[:, :, mesh.layer_cells[-1][0] :]
+    n_radial = settings.radial[-1]
+    outer_face = element.node_grid[:, 0] == element.order
+    X_facet = outer_layer[:, outer_face, n_radial - 1 :: n_radial]
+    tangents = jnp.einsum("qka,iac->kiqc", dN_facet, X_facet)
+    return Geometry(
+        to_local=stacked(product(inverse(jacobian), axes)),
+        dV=dV,
+        dA=norm(cross(tangents[0], tangents[1])) * facet_weights[:, None],
+        pressure_stiffness=jnp.moveaxis(jnp.linalg.inv(M), 0, -1),
+    )
+
+
+def _cylindrical_axes(X: Array) -> Array:
+    """Unit vectors (radial, circumferential, axial) at X (3, *batch), as rows: (3, 3, *batch)."""
+    length, zero = norm((X[0], X[1])), jnp.zeros_like(X[0])
+    cosine, sine = X[0] / length, X[1] / length
+    rows = [(cosine, sine, zero), (-sine, cosine, zero), (zero, zero, zero + 1.0)]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def material_groups(materials: tuple[Material, ...]) -> tuple[tuple[int, int], ...]:
+    """Runs of consecutive layers with one law (first, last + 1): each run is one compiled kernel."""
+    groups: list[tuple[int, int]] = []
+    for i, material in enumerate(materials):
+        if groups and shape_of(materials[groups[-1][0]])[0] == shape_of(material)[0]:
+            groups[-1] = (groups[-1][0], i + 1)
+        else:
+            groups.append((i, i + 1))
+    return tuple(groups)
+
+
+def over_cells(materials: tuple[Material, ...], counts: tuple[int, ...]) -> Any:
+    """One material whose constants are arrays over the cells of several layers, (n_cells,)."""
+    return jax.tree_util.tree_map(
+        lambda *leaves: jnp.concatenate(
+            [jnp.broadcast_to(leaf, (n,)) for leaf, n in zip(leaves, counts, strict=True)]
+        ),
+        *materials,
+    )
+
+
+def wall_density(dx_dxi: Tensor, to_local: Tensor, dV: Array, material: Material, p: Array) -> Array:
+    """[psi_bar(F) + p (J - 1)] dV at the points of some cells, uJ.
+
+    dx_dxi: current tangents, [local direction, component], each (n_q, n_cells)
+    p: pressure interpolated at the points, kPa, (n_q, n_cells)
+    """
+    F = product(transpose(dx_dxi), to_local)
+    return (material.psi_bar(F) + p * (det(F) - 1.0)) * dV
+
+
+def dilatation_density(dx_dxi: Tensor, to_local: Tensor, dV: Array) -> Array:
+    """(J - 1) dV at the points, mm^3."""
+    return (det(dx_dxi) * det(to_local) - 1.0) * dV
+
+
+def lumen_density(y: Tensor, weights: Array) -> Array:
+    """Part of the lumen's volume, 1/2 (x n_x + y n_y) da, mm^3; the ends are planar, so no end term.
+
+    y: position and its circumferential and axial derivatives, [which, component], each (n_q, n_facets)
+    """
+    normal = cross([y[1, i] for i in range(3)], [y[2, i] for i in range(3)])
+    return 0.5 * (y[0, 0] * normal[0] + y[0, 1] * normal[1]) * weights
+
+
+def contact_density(y: Tensor, jaw_height: Array, jaw: Jaw, contact: Contact, dA: Array) -> Array:
+    """Contact energy of the outer wall, uJ.
+
+    y: current position, [0, component], each (n_q, n_facets); jaw_height: mm
+    """
+    return contact.energy(jaw_gap([y[0, i] for i in range(3)], jaw_height, jaw)) * dA
+
+
+def jaw_gap(x: Vector, jaw_height: Array, jaw: Jaw) -> Array:
+    """Distance of points x (components first) from a jaw whose lowest point is at `jaw_height`."""
+    return jaw.gap((x[0], x[1] - jaw_height, x[2]))

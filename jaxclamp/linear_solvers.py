@@ -1,0 +1,193 @@
+"""Sparse symmetric direct solvers behind one protocol: factor, solve, inertia.
+
+The pattern (upper triangle, compressed rows) is analysed once; values change. Every solve is
+checked against the matrix and refined once if needed; a back end that fails hands over to
+the next one, and SciPy's SuperLU is always there.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+
+from jaxclamp.assembly import Pattern
+
+RELATIVE_RESIDUAL = 1e-8
+"""A solution with a larger ||K x - b|| / ||b|| is refused."""
+
+
+class Singular(Exception):
+    """The matrix could not be factored, or its solutions are inaccurate."""
+
+
+class BackEnd(Protocol):
+    """One way to factor a symmetric matrix with a fixed pattern."""
+
+    def factor(self, values: np.ndarray) -> int | None:
+        """Factor; returns the number of negative eigenvalues, None if unknown. May raise Singular."""
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        """Solve for right-hand sides (n, n_rhs)."""
+
+
+class _Pardiso:
+    """MKL PARDISO, L D L' with Bunch-Kaufman pivots (py-mkl-pardiso)."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        self._pattern = pattern
+        self._solver = None
+
+    def factor(self, values: np.ndarray) -> int | None:
+        import pymklpardiso
+
+        if not np.all(np.isfinite(values)):
+            raise Singular("the tangent is not finite")
+        try:
+            if self._solver is None:
+                n = self._pattern.n
+                matrix = sp.csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(n, n))
+                self._solver = pymklpardiso.PardisoSolver(
+                    matrix, pymklpardiso.MTYPE_REAL_SYM_INDEF, iparms=_PARDISO_SETTINGS
+                )
+            else:
+                self._solver.refactor(values)
+        except RuntimeError as error:
+            raise Singular(str(error)) from error
+        if self._solver.get_iparm_value(13) > 0:
+            raise Singular("the tangent is singular to working precision")
+        return int(self._solver.get_iparm_value(22))
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        return np.asarray(self._solver.solve(b))
+
+
+# indices and meanings: oneMKL reference, pardiso iparm. No default start (0), METIS (1), no
+# refinement by PARDISO (7: ours is checked), pivot perturbation 1e-13 (9), scaling and matching
+# off (10, 12): the tangent is near definite, and the analysis must not depend on values.
+_PARDISO_SETTINGS = {0: 1, 1: 2, 7: 0, 9: 13, 10: 0, 12: 0, 17: -1}
+
+
+class _Rslab:
+    """RSLAB, supernodal L D L' (rslab)."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        self._pattern = pattern
+        self._symbolic = None
+
+    def _lower(self, values: np.ndarray) -> sp.csc_matrix:
+        n = self._pattern.n  # the upper triangle by rows is the lower one by columns
+        return sp.csc_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(n, n))
+
+    def factor(self, values: np.ndarray) -> int | None:
+        import rslab
+
+        if not np.all(np.isfinite(values)):
+            raise Singular("the tangent is not finite")
+        try:
+            if self._symbolic is None:
+                self._symbolic = rslab.analyze(self._lower(values), path="ldlt", ordering="metis", threads=2)
+            self._factors = self._symbolic.factor(self._lower(values))
+        except (RuntimeError, ValueError, ArithmeticError) as error:
+            raise Singular(str(error)) from error
+        return int(self._factors.inertia[1])
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        return np.asarray(self._factors.solve_many(b))
+
+
+class _SuperLU:
+    """SciPy's SuperLU in symmetric mode; no inertia."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        self._pattern = pattern
+
+    def factor(self, values: np.ndarray) -> int | None:
+        if not np.all(np.isfinite(values)):
+            raise Singular("the tangent is not finite")
+        try:
+            self._factors = scipy.sparse.linalg.splu(
+                full_matrix(self._pattern, values).tocsc(),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError as error:
+            raise Singular(str(error)) from error
+        return None
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        return self._factors.solve(b)
+
+
+def full_matrix(pattern: Pattern, values: np.ndarray) -> sp.csr_matrix:
+    """Both triangles of the symmetric matrix."""
+    n = pattern.n
+    upper = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(n, n))
+    return (upper + sp.triu(upper, k=1).T).tocsr()
+
+
+BACK_ENDS = {"pardiso": (_Pardiso, "pymklpardiso"), "rslab": (_Rslab, "rslab"), "splu": (_SuperLU, "scipy")}
+
+
+def available() -> list[str]:
+    """Names of the back ends that can be imported, best first."""
+    return [name for name, (_, module) in BACK_ENDS.items() if importlib.util.find_spec(module)]
+
+
+class LinearSolver:
+    """Factor and solve with the first back end that can; counts and times what it does."""
+
+    def __init__(self, pattern: Pattern, choice: str = "auto") -> None:
+        self._pattern = pattern
+        names = available()
+        if choice != "auto":
+            names = [choice, *[n for n in names if n != choice]]
+        self._names = names
+        self._back_end: BackEnd = BACK_ENDS[names[0]][0](pattern)
+        self._values: np.ndarray = np.empty(0)
+        self.factorisations = 0
+        self.factor_seconds = 0.0
+
+    @property
+    def name(self) -> str:
+        """The back end in use."""
+        return self._names[0]
+
+    def factor(self, values: np.ndarray) -> int | None:
+        """Factor the matrix; returns its number of negative eigenvalues, None if unknown.
+
+        Raises Singular if no back end can.
+        """
+        start = time.perf_counter()
+        self.factorisations += 1
+        self._values = values
+        try:
+            return self._back_end.factor(values)
+        finally:
+            self.factor_seconds += time.perf_counter() - start
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        """Solve K x = b for b (n, n_rhs), checked. Raises Singular if it is not accurate."""
+        while True:
+            x = self._back_end.solve(b)
+            for _ in range(2):
+                error = b - self._times(x)
+                if np.all(np.linalg.norm(error, axis=0) <= RELATIVE_RESIDUAL * np.linalg.norm(b, axis=0)):
+                    return x
+                x = x + self._back_end.solve(error)
+            if len(self._names) == 1 or not np.all(np.isfinite(self._values)):
+                raise Singular("the linear system could not be solved accurately")
+            self._names = self._names[1:]
+            self._back_end = BACK_ENDS[self._names[0]][0](self._pattern)
+            self._back_end.factor(self._values)
+
+    def _times(self, x: np.ndarray) -> np.ndarray:
+        n = self._pattern.n
+        upper = sp.csr_matrix((self._values, self._pattern.indices, self._pattern.indptr), shape=(n, n))
+        diagonal = self._values[self._pattern.indptr[:-1]]
+        return upper @ x + upper.T @ x - diagonal[:, None] * x

@@ -1,0 +1,245 @@
+"""What is read off an equilibrium: stresses, lumen, forces, contact, peaks, and independent checks.
+
+Everything is a JAX function of the body and its states, so that it can be differentiated; all
+sizes are those of the whole artery, not of the modelled eighth.
+
+Axial stress is the Cauchy stress along the artery's axis, sigma_zz, as in the seed's maps.
+Circumferential and radial stress are those along the deformed image of the stress-free
+circumferential and radial lines: the wall carries these directions with it when it flattens.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxclamp.assembly import Body, State, at_points, contact_potential, gaps, potential
+from jaxclamp.elements import Element, gauss, lagrange, tensor_rule
+from jaxclamp.energies import material_groups, over_cells
+from jaxclamp.meshes import Mesh
+from jaxclamp.pytree import record, static
+from jaxclamp.tensors import cross, det, norm, product, smooth_maximum, stacked, transpose
+
+PARTS = 8
+"""the model is one eighth of the artery"""
+PARTS_OF_A_JAW = 4
+"""and carries a quarter of the force on one jaw"""
+PEAK_SHARPNESS = 40.0
+"""exponent of the power mean that stands for a maximum"""
+
+
+@record
+class Landmarks:
+    """Nodes where the seed looks, and the stencils of the quantities read there."""
+
+    lumen_top: int = static()
+    """inner surface, compression axis, mid-length"""
+    lumen_ring: np.ndarray
+    """inner surface at mid-length, from the fold to the compression axis, (n_c,)"""
+    outer_top: int = static()
+    """outer surface, compression axis, mid-length"""
+    P_cell: int = static()
+    """cell whose corner is P: inner surface of the media, compression axis, mid-length"""
+    P_weights: np.ndarray
+    """extrapolation from that cell's quadrature points to P, (n_q,)"""
+    fold_plane: np.ndarray
+    """nodes with y = 0"""
+    layer_names: tuple[str, ...] = static()
+    element: Element = static()
+
+
+def extrapolation(element: Element) -> np.ndarray:
+    """From values at a cell's quadrature points to its nodes, (n_en, n_q)."""
+    nodes = tensor_nodes(element)
+    return lagrange(gauss(element.points_per_axis)[0], nodes)[0]
+
+
+def tensor_nodes(element: Element) -> np.ndarray:
+    """Local coordinates of the nodes, (n_en, 3)."""
+    return element.nodes_1d[element.node_grid]
+
+
+def find_landmarks(mesh: Mesh, layer_names: tuple[str, ...]) -> Landmarks:
+    """The nodes and cells of interest; P is on the innermost layer called "media", or the innermost."""
+    layer = layer_names.index("media") if "media" in layer_names else 0
+    P = mesh.node(mesh.layer_inner_line(layer), -1, 0)
+    first, last = mesh.layer_cells[layer]
+    corner, cell = np.argwhere(mesh.cells[:, first:last] == P)[0]
+    return Landmarks(
+        lumen_top=mesh.node(0, -1, 0),
+        lumen_ring=np.array([mesh.node(0, c, 0) for c in range(mesh.grid[1])]),
+        outer_top=mesh.node(-1, -1, 0),
+        P_cell=int(first + cell),
+        P_weights=extrapolation(mesh.element)[corner],
+        fold_plane=mesh.fold_plane,
+        layer_names=layer_names,
+        element=mesh.element,
+    )
+
+
+def deformation(body: Body, x: Array) -> dict[tuple[int, int], Array]:
+    """Deformation gradient by components, columns along the material axes, each (n_q, n_cells)."""
+    dx_dxi = at_points(body.stencils.wall, jnp.swapaxes(x[body.topology.cells], 1, 2))
+    return product(transpose(dx_dxi), body.geometry.to_local)
+
+
+def cauchy_stress(body: Body, state: State) -> tuple[dict[tuple[int, int], Array], Array]:
+    """Deformation gradient, and Cauchy stress (3, 3, n_q, n_cells) in kPa, Eqs. (7) to (9).
+
+    sigma = p I + (1/J) d psi_bar/dF F', with the pressure of the cell.
+    """
+    F = deformation(body, state.x)
+    ranges, materials = body.topology.layer_cells, body.parameters.materials
+    parts = []
+    for first, last in material_groups(materials):
+        start, stop = ranges[first][0], ranges[last - 1][1]
+        material = over_cells(materials[first:last], tuple(b - a for a, b in ranges[first:last]))
+        local = {key: value[:, start:stop] for key, value in F.items()}
+        P = jax.grad(lambda G, m=material: jnp.sum(m.psi_bar(G)))(local)
+        parts.append(stacked(product(P, transpose(local))) / det(local))
+    p = jnp.einsum("mq,mc->qc", body.stencils.modes, state.p)
+    return F, jnp.concatenate(parts, axis=-1) + p * jnp.eye(3)[:, :, None, None]
+
+
+def along(F: dict[tuple[int, int], Array], sigma: Array, axis: int) -> Array:
+    """Normal stress along the deformed image of a material axis (0 radial, 1 circumferential), kPa."""
+    t = [F[i, axis] for i in range(3)]
+    squared_length = sum(component * component for component in t)
+    return sum(t[i] * sigma[i, j] * t[j] for i in range(3) for j in range(3)) / squared_length
+
+
+@record
+class Stresses:
+    """Stress at the quadrature points, kPa, each (n_q, n_cells)."""
+
+    circumferential: Array
+    axial: Array
+    radial: Array
+    """along the deformed image of the radial line"""
+    greatest: Array
+    """greatest principal stress"""
+    J: Array
+    """volume ratio"""
+
+
+@jax.jit
+def stresses(body: Body, state: State) -> Stresses:
+    """Stress components of interest at every quadrature point."""
+    F, sigma = cauchy_stress(body, state)
+    return Stresses(
+        circumferential=along(F, sigma, 1),
+        axial=sigma[2, 2],
+        radial=along(F, sigma, 0),
+        greatest=jnp.linalg.eigvalsh(jnp.moveaxis(sigma, (0, 1), (-2, -1)))[..., -1],
+        J=det(F),
+    )
+
+
+def lumen_ring_area(ring: Array, element: Element) -> Array:
+    """Area inside the closed lumen whose first quadrant is the curve `ring` (n_c, 2), mm^2."""
+    m = element.order
+    points, weights = gauss(m + 1)
+    N, dN = lagrange(element.nodes_1d, points[:, None])
+    starts = np.arange(0, ring.shape[0] - 1, m)
+    edges = ring[starts[:, None] + np.arange(m + 1)]  # (n_edges, m + 1, 2)
+    x, dx = jnp.einsum("qa,eai->qei", N, edges), jnp.einsum("qa,eai->qei", dN[:, 0], edges)
+    swept = 0.5 * (x[..., 0] * dx[..., 1] - x[..., 1] * dx[..., 0])
+    return 4.0 * jnp.sum(weights[:, None] * swept)
+
+
+def contact_pressure(body: Body, state: State, element: Element) -> tuple[Array, Array]:
+    """Contact pressure on the deformed outer wall, kPa, and current area of the points, mm^2."""
+    facets = body.topology.outer_facets
+    n = round(body.stencils.contact.shape[0] ** 0.5)
+    points, weights = tensor_rule((n, n))
+    tangents = jnp.einsum("qka,aci->kiqc", lagrange(element.nodes_1d, points)[1], state.x[facets])
+    da = norm(cross(tangents[0], tangents[1])) * weights[:, None]
+    pressure = -jax.grad(lambda g: jnp.sum(body.parameters.contact.energy(g)))(gaps(body, state))
+    return pressure * body.geometry.dA / da, da
+
+
+@partial(jax.jit, static_argnames=())
+def observe(body: Body, state: State, pressure: Array, marks: Landmarks) -> dict[str, Any]:
+    """Every number reported of one equilibrium, keys as in result.json, JAX scalars.
+
+    Lengths mm, stresses kPa, forces N, energies uJ. Residual and force balance are computed from
+    the gradient of the potential, not from the assembled system that was solved.
+    """
+    s = stresses(body, state)
+    top = state.x[marks.lumen_top, 1]
+    ring = state.x[marks.lumen_ring, :2]
+    gap = gaps(body, state)
+    pressures, areas = contact_pressure(body, state, marks.element)
+    touching = pressures > 0.0
+    loaded_area = jnp.sum(jnp.where(touching, areas, 0.0))
+
+    total, force = jax.value_and_grad(potential, argnums=1)(body, state.x, state.jaw_height, pressure)
+    free = force.ravel()[body.topology.free]
+    jaw_force = -jax.grad(contact_potential, argnums=2)(body, state.x, state.jaw_height)
+    pushed = pressure * _lifting(body, state)
+    elastic = jax.grad(potential, argnums=1)(body, state.x, state.jaw_height, 0.0)
+    support = jnp.sum((elastic[:, 1] - pushed)[marks.fold_plane])
+    imbalance = jnp.abs(support + jnp.sum(pushed) - jaw_force)
+
+    report = {
+        "jaw_height_mm": state.jaw_height,
+        "lumen_height_mm": 2.0 * top,
+        "lumen_width_mm": 2.0 * jnp.max(ring[:, 0]),
+        "lumen_area_mm2": lumen_ring_area(ring, marks.element),
+        "outer_radius_mm": state.x[marks.outer_top, 1],
+        "clamp_force_N": 1e-3 * PARTS_OF_A_JAW * jaw_force,
+        "max_contact_pressure_kPa": jnp.max(pressures),
+        "mean_contact_pressure_kPa": jnp.where(
+            loaded_area > 0.0, jnp.sum(pressures * areas) / jnp.where(loaded_area > 0.0, loaded_area, 1.0), 0.0
+        ),
+        "contact_area_mm2": PARTS_OF_A_JAW * loaded_area,
+        "max_penetration_mm": jnp.maximum(jnp.max(-gap), 0.0),
+        "axial_stress_at_P_kPa": marks.P_weights @ s.axial[:, marks.P_cell],
+        "circumferential_stress_at_P_kPa": marks.P_weights @ s.circumferential[:, marks.P_cell],
+        "J_min": jnp.min(s.J),
+        "J_max": jnp.max(s.J),
+        "total_energy_uJ": PARTS * total,
+        "residual_mN": jnp.linalg.norm(free),
+        "force_balance_error": imbalance / jnp.maximum(jnp.abs(jaw_force), jnp.sum(pushed) + 1e-12),
+    }
+    positions = at_points_of_cells(body, state.x, marks.element)
+    ranges = dict(zip(marks.layer_names, body.topology.layer_cells, strict=True))
+    peaks: dict[str, dict[str, Array]] = {
+        "peak_axial_stress_kPa": {},
+        "peak_axial_stress_location_mm": {},
+        "smooth_peak_axial_stress_kPa": {},
+        "peak_circumferential_stress_kPa": {},
+        "peak_principal_stress_kPa": {},
+    }
+    for name, (first, last) in ranges.items():
+        axial = s.axial[:, first:last]
+        place = jnp.argmax(axial)
+        peaks["peak_axial_stress_kPa"][name] = axial.ravel()[place]
+        peaks["peak_axial_stress_location_mm"][name] = positions[:, :, first:last].reshape(3, -1)[:, place]
+        peaks["smooth_peak_axial_stress_kPa"][name] = smooth_maximum(
+            axial, body.geometry.dV[:, first:last], PEAK_SHARPNESS
+        )
+        peaks["peak_circumferential_stress_kPa"][name] = jnp.max(s.circumferential[:, first:last])
+        peaks["peak_principal_stress_kPa"][name] = jnp.max(s.greatest[:, first:last])
+    return report | peaks
+
+
+def at_points_of_cells(body: Body, x: Array, element: Element) -> Array:
+    """Current position of the quadrature points, mm, (3, n_q, n_cells)."""
+    N = element.shape(element.quadrature()[0])[0]
+    return jnp.einsum("qa,aci->iqc", N, x[body.topology.cells])
+
+
+def _lifting(body: Body, state: State) -> Array:
+    """Vertical force of a unit pressure on each node, mm^2: int N n_y da, (n_nodes,)."""
+    facets = body.topology.lumen_facets
+    n = round(body.stencils.lumen.shape[0] ** 0.5)
+    weights = tensor_rule((n, n))[1][:, None]
+    y = at_points(body.stencils.lumen, jnp.swapaxes(state.x[facets], 1, 2))
+    at_corners = body.stencils.lumen[:, 0].T @ (cross(y[1], y[2])[1] * weights)
+    return jnp.zeros(state.x.shape[0]).at[facets].add(at_corners)

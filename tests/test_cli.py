@@ -1,0 +1,400 @@
+"""The command line: exit codes, one sentence for a mistake, and nothing else on standard output."""
+
+import dataclasses
+import errno
+import json
+import math
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from jaxclamp.cli import main
+from jaxclamp.equilibrium import EquilibriumError
+from jaxclamp.presets import presets
+
+FIGURES = {
+    "title": "Human LAD",
+    "converged": True,
+    "physiological": {"lumen_radius_mm": 2.5123},
+    "final": {
+        "occlusion": 0.925,
+        "clamp_force_N": 0.4789,
+        "lumen_height_mm": None,
+        "max_penetration_mm": math.nan,
+        "peak_axial_stress_kPa": {"media": 41.23, "adventitia": 39.9},
+    },
+}
+
+
+@dataclasses.dataclass
+class FakeResult:
+    """What the command needs of a result."""
+
+    converged: bool = True
+    failure: Exception | None = None
+
+    def to_dict(self):
+        return FIGURES | {"converged": self.converged}
+
+
+def failed():
+    return EquilibriumError("clamping", "91 % occlusion", 1.0, 0.2, "refine the mesh")
+
+
+class Engine:
+    """Stands in for clamping and export: records what it was asked."""
+
+    def __init__(self):
+        self.scenes, self.written = [], []
+        self.outcome = FakeResult()
+        self.write_error = None
+
+    def clamp(self, scene, *, guess=None, progress=None):
+        self.scenes.append(scene)
+        if callable(progress):
+            for stage in ("load-free", "clamping"):
+                for step in range(101):
+                    event = types.SimpleNamespace(stage=stage, fraction=step / 100, message="[b]step[/b]")
+                    progress(event)
+        if isinstance(self.outcome, BaseException):
+            raise self.outcome
+        return self.outcome
+
+    def describe(self, scene):
+        return {
+            "symmetry": "one eighth",
+            "layers": ["media", "adventitia"],
+            "terms": [("wall", "always")],
+            "unknowns": 4266,
+            "predicted_seconds": 3.0,
+            "warnings": [],
+        }
+
+    def write_outputs(self, result, folder):
+        if self.write_error is not None:
+            raise self.write_error
+        folder.mkdir(parents=True, exist_ok=True)
+        names = ("result.json", "figure.png", "report.html")
+        for name in names:
+            (folder / name).write_text(json.dumps({"converged": result.converged}))
+        return [folder / name for name in names]
+
+
+@pytest.fixture
+def engine(monkeypatch, tmp_path):
+    """The command line with a stand-in for the solver, in an empty folder."""
+    fake = Engine()
+    clamping, export = types.ModuleType("jaxclamp.clamping"), types.ModuleType("jaxclamp.export")
+    clamping.clamp, clamping.describe, export.write_outputs = fake.clamp, fake.describe, fake.write_outputs
+    monkeypatch.setitem(sys.modules, "jaxclamp.clamping", clamping)
+    monkeypatch.setitem(sys.modules, "jaxclamp.export", export)
+    monkeypatch.chdir(tmp_path)
+    return fake
+
+
+def call(capsys, *arguments):
+    code = main(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def command(*arguments, cwd):
+    root = Path(__file__).parents[1]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    return subprocess.run(
+        [sys.executable, "-m", "jaxclamp", *arguments],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def everything_below(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+# ------------------------------------------------------------------------------------- run
+
+
+def test_run_writes_beside_us_and_says_what_to_open(engine, capsys, tmp_path):
+    code, out, err = call(capsys, "run", "human-lad")
+    assert code == 0
+    assert everything_below(tmp_path / "human-lad-result") == ["figure.png", "report.html", "result.json"]
+    assert out.index("report.html") < out.index("result.json")
+    assert "figure.png" not in out
+    assert "clamp force" in out
+    assert "0.4789 N" in out
+    assert "peak axial stress, adventitia" in out
+    assert "load-free:   0%" in err
+    assert "clamping: 100%" in err
+
+
+def test_run_out_chooses_the_folder(engine, capsys, tmp_path):
+    code, *_ = call(capsys, "run", "human-lad", "--out", "a/b")
+    assert code == 0
+    assert everything_below(tmp_path) == ["a", "a/b", "a/b/figure.png", "a/b/report.html", "a/b/result.json"]
+
+
+def test_run_passes_overrides_and_fidelity_on(engine, capsys):
+    options = ("--set", "clamp.jaw.radius_mm=1.5", "--set", "stop.travel_mm=2", "--fidelity", "draft")
+    code, _, err = call(capsys, "run", "human-lad", *options)
+    assert code == 0
+    (scene,) = engine.scenes
+    assert (scene.clamp.jaw.radius, scene.stop.travel, scene.mesh.axial) == (1.5, 2.0, 10)
+    assert "note:" not in err
+
+
+def test_run_notes_a_fidelity_that_the_scene_overrules(engine, capsys, tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'artery = "human-lad-wall"\n[clamp]\njaw = "flat-2mm"\n[stop]\nocclusion = 0.9\n[mesh]\naxial = 12\n'
+    )
+    code, _, err = call(capsys, "run", "mine.toml", "--fidelity", "reference")
+    assert code == 0
+    assert engine.scenes[0].mesh.axial == 12
+    assert err.splitlines()[0].startswith("note: mine.toml sets mesh.axial itself")
+    assert "note:" not in call(capsys, "run", "mine.toml")[2]
+    assert (tmp_path / "mine-result" / "report.html").exists()
+
+
+@pytest.mark.parametrize("options", [(), ("--quiet",)])
+def test_json_is_alone_on_standard_output_and_nothing_is_written(engine, capsys, tmp_path, options):
+    code, out, err = call(capsys, "run", "human-lad", "--json", *options)
+    assert code == 0
+    content = json.loads(out, parse_constant=pytest.fail)
+    assert content["final"]["clamp_force_N"] == 0.4789
+    assert content["final"]["max_penetration_mm"] is None
+    assert everything_below(tmp_path) == []
+    assert bool(err) != bool(options)
+
+
+def test_json_with_a_folder_does_both(engine, capsys, tmp_path):
+    code, out, _ = call(capsys, "run", "human-lad", "--json", "--out", "here")
+    assert code == 0
+    assert json.loads(out)["converged"] is True
+    assert "here/result.json" in everything_below(tmp_path)
+
+
+def test_quiet_is_silent(engine, capsys):
+    assert call(capsys, "run", "human-lad", "--quiet") == (0, "", "")
+
+
+def test_progress_is_not_a_line_for_every_step(engine, capsys):
+    _, _, err = call(capsys, "run", "human-lad")
+    lines = err.splitlines()
+    assert 20 <= len(lines) <= 50
+    assert "[b]step[/b]" in lines[0]
+
+
+def test_progress_on_a_terminal_is_a_bar_and_leaves_standard_output_alone(engine, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    code, out, err = call(capsys, "run", "human-lad", "--json")
+    assert code == 0
+    assert json.loads(out)["converged"] is True
+    assert "clamping" in err
+    assert "[b]step[/b]" in err
+
+
+# ------------------------------------------------------------------------------------- no solution
+
+
+@pytest.mark.parametrize("raised", [True, False])
+def test_no_solution_keeps_what_converged(engine, capsys, tmp_path, raised):
+    partial = FakeResult(converged=False, failure=failed())
+    engine.outcome = partial
+    if raised:
+        engine.outcome = failed()
+        engine.outcome.result = partial
+    code, out, err = call(capsys, "run", "human-lad", "--json", "--out", "kept")
+    assert code == 3
+    assert json.loads(out)["converged"] is False
+    assert json.loads((tmp_path / "kept" / "result.json").read_text())["converged"] is False
+    sentence = err.splitlines()[-1]
+    assert all(word in sentence for word in ("clamping", "91 % occlusion", "refine the mesh", "kept"))
+    assert "Traceback" not in err
+
+
+def test_no_solution_says_so_above_its_figures(engine, capsys):
+    engine.outcome = FakeResult(converged=False, failure=failed())
+    code, out, _ = call(capsys, "run", "human-lad")
+    assert code == 3
+    assert "NOT CONVERGED" in out.splitlines()[0]
+
+
+def test_no_solution_at_all_writes_nothing(engine, capsys, tmp_path):
+    engine.outcome = failed()
+    code, out, err = call(capsys, "run", "human-lad", "--quiet")
+    assert (code, out, len(err.splitlines())) == (3, "", 1)
+    assert everything_below(tmp_path) == []
+
+
+# ------------------------------------------------------------------------------------- the machine
+
+
+@pytest.mark.parametrize(
+    ("error", "word"),
+    [
+        (MemoryError(), "memory"),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes"), "memory"),
+    ],
+)
+def test_lack_of_memory_is_exit_4(engine, capsys, error, word):
+    engine.outcome = error
+    code, out, err = call(capsys, "run", "human-lad", "--quiet")
+    assert (code, out, len(err.splitlines())) == (4, "", 1)
+    assert word in err
+
+
+def test_a_full_disk_is_exit_4(engine, capsys):
+    engine.write_error = OSError(errno.ENOSPC, "No space left on device", "human-lad-result/result.json")
+    code, out, err = call(capsys, "run", "human-lad", "--quiet")
+    assert (code, out, len(err.splitlines())) == (4, "", 1)
+    assert "No space left on device" in err
+    assert "human-lad-result/result.json" in err
+
+
+def test_an_interruption_is_exit_130_on_one_line(engine, capsys):
+    engine.outcome = KeyboardInterrupt()
+    code, out, err = call(capsys, "run", "human-lad", "--quiet")
+    assert (code, out) == (130, "")
+    assert err.strip() == "jaxclamp: interrupted"
+
+
+def test_a_mistake_of_the_program_is_not_hidden(engine, capsys):
+    engine.outcome = ZeroDivisionError("a bug")
+    with pytest.raises(ZeroDivisionError):
+        main(["run", "human-lad", "--quiet"])
+
+
+# ------------------------------------------------------------------------------------- wrong input
+
+WRONG = {
+    "unknown preset": (["run", "human-lat"], "human-lad"),
+    "missing file": (["run", "nowhere.toml"], "nowhere.toml"),
+    "a folder": (["run", "."], "."),
+    "wrong value": (["run", "human-lad", "--set", "clamp.jaw.radius_mm=-1"], "clamp.jaw.radius_mm = -1"),
+    "unknown key": (["run", "human-lad", "--set", "clamp.jaw.radios_mm=1"], "did you mean radius_mm?"),
+    "no override": (["run", "human-lad", "--set", "clamp"], "KEY=VALUE"),
+    "cannot close": (["run", "human-lad", "--set", "artery.layers[0].opening_angle_deg=340"], "close"),
+    "unknown fidelity": (["run", "human-lad", "--fidelity", "fine"], "draft, standard, reference"),
+    "file for a folder": (["run", "human-lad", "--out", "file"], "'file'"),
+    "file in the path": (["run", "human-lad", "--out", "file/a/b"], "'file/a/b'"),
+    "null in the path": (["run", "human-lad", "--out", "a\0b"], "--out"),
+    "no scene": (["run"], "SCENE"),
+    "unknown option": (["run", "human-lad", "--jsn"], "--jsn"),
+    "option without value": (["run", "human-lad", "--out"], "--out"),
+    "unknown command": (["optimize", "human-lad"], "optimize"),
+    "show, wrong value": (["show", "human-lad", "--set", "mesh.axial=0"], "mesh.axial = 0"),
+    "show, unknown preset": (["show", "rabbit"], "rabbit-carotid"),
+    "presets, unknown": (["presets", "flat-2m"], "flat-2mm"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_input_is_one_sentence_exit_2_and_nothing_written(engine, capsys, tmp_path, name):
+    arguments, word = WRONG[name]
+    (tmp_path / "file").write_text("precious")
+    code, out, err = call(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert err.startswith("jaxclamp: ")
+    assert word in err
+    assert engine.scenes == [], "nothing is solved"
+    assert everything_below(tmp_path) == ["file"]
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root and Windows may write anywhere")
+def test_a_folder_without_permission_is_refused(engine, capsys, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    code, _, err = call(capsys, "run", "human-lad", "--out", "locked")
+    assert code == 2
+    assert "locked" in err
+    assert engine.scenes == []
+
+
+# ------------------------------------------------------------------------------------- show, presets
+
+
+def test_show_describes_and_solves_nothing(engine, capsys, tmp_path):
+    code, out, err = call(capsys, "show", "human-lad")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[0] == "Human LAD between two cylinders"
+    assert all(
+        word in out for word in ("symmetry: one eighth", "adventitia", "wall: always", "unknowns: 4266")
+    )
+    assert "predicted: 3 s" in out
+    assert "warnings" not in out
+    assert engine.scenes == []
+    assert everything_below(tmp_path) == []
+
+
+def test_show_json(engine, capsys):
+    _, out, _ = call(capsys, "show", "human-lad", "--json")
+    assert json.loads(out)["unknowns"] == 4266
+
+
+def test_presets_are_listed_by_kind_name_and_title(capsys):
+    code, out, err = call(capsys, "presets")
+    assert (code, err) == (0, "")
+    listed = [line.split(maxsplit=2) for line in out.splitlines()]
+    assert listed == [[p.kind, p.name, p.title] for p in presets()]
+    assert [kind for kind, *_ in listed] == sorted(
+        (kind for kind, *_ in listed), key=["scene", "artery", "jaw"].index
+    )
+    assert json.loads(call(capsys, "presets", "--json")[1])[0]["name"] == "human-lad"
+
+
+@pytest.mark.parametrize("name", [p.name for p in presets()])
+def test_a_preset_is_printed_as_it_is(capsys, name):
+    code, out, _ = call(capsys, "presets", name)
+    assert code == 0
+    assert out == next(p.text for p in presets() if p.name == name)
+
+
+def test_a_printed_scene_is_a_scene_file(engine, capsys, tmp_path):
+    (tmp_path / "copy.toml").write_text(call(capsys, "presets", "human-lad")[1])
+    assert call(capsys, "show", "copy.toml")[0] == 0
+
+
+# ------------------------------------------------------------------------------------- as a program
+
+
+def test_help_names_the_commands(tmp_path):
+    done = command("--help", cwd=tmp_path)
+    assert done.returncode == 0
+    assert all(name in done.stdout for name in ("show", "run", "presets"))
+    assert done.stderr == ""
+    assert "--fidelity" in command("run", "--help", cwd=tmp_path).stdout
+
+
+def test_wrong_input_as_a_program(tmp_path):
+    done = command("run", "human-lad", "--set", "artery.pressure_kPa=nan", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1
+    assert "artery.pressure_kPa = nan: expected a number at least 0 kPa" in done.stderr
+    assert everything_below(tmp_path) == []
+
+
+def test_a_reader_that_goes_away_is_no_error(tmp_path):
+    root = Path(__file__).parents[1]
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxclamp", "presets"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(root)},
+        stdout=write_end,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,67 @@
+"""Scenes for tests, and the engine's own way to their load-free and physiological states."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+import jaxclamp as jc
+from jaxclamp.clamping import _Walk
+from jaxclamp.equilibrium import Equilibrium
+from jaxclamp.materials import HGO, Material, NeoHookean
+from jaxclamp.model import Model, build_model
+from jaxclamp.scene import Layer, MeshSettings, Scene
+from tube import Sector
+
+
+def mesh(element: str, circumferential: int, axial: int, radial: tuple[int, ...], **others: Any) -> MeshSettings:
+    """Mesh settings by position."""
+    return MeshSettings(
+        element=element, circumferential=circumferential, axial=axial, radial=radial, **others
+    )
+
+
+def material(sector: Sector, bulk: float) -> Material:
+    """The engine's law for a layer of the semi-analytic tube."""
+    if sector.law == "neo":
+        return NeoHookean(c=sector.c, bulk=bulk)
+    return HGO(
+        c=sector.c,
+        k1=sector.k1,
+        k2=sector.k2,
+        fibre_angle=np.deg2rad(sector.fibre_angle),
+        bulk=bulk,
+        fibre_energy=sector.law,
+    )
+
+
+def tube_scene(
+    sectors: tuple[Sector, ...], pressure: float, stretch: float, settings: MeshSettings, bulk: float = 1e4
+) -> Scene:
+    """A short piece of the tube of `sectors` (its length does not matter)."""
+    layers = tuple(
+        Layer(
+            name=f"layer {i}",
+            inner_radius=sector.inner_radius,
+            thickness=sector.thickness,
+            opening_angle=np.deg2rad(sector.opening_angle),
+            material=material(sector, bulk),
+        )
+        for i, sector in enumerate(sectors)
+    )
+    scene = jc.load_scene("human-lad")
+    artery = dataclasses.replace(
+        scene.artery, length=4.0, axial_stretch=stretch, pressure=pressure, layers=layers
+    )
+    return dataclasses.replace(scene, artery=artery, mesh=settings)
+
+
+def inflate(scene: Scene, like: Model | None = None) -> tuple[Model, Equilibrium, Equilibrium]:
+    """Model, load-free and physiological state, without reading anything off them."""
+    model = build_model(scene, like)
+    walk = _Walk(model, lambda event: None)
+    walk.keep = lambda *_: None  # type: ignore[method-assign]
+    load_free = walk.load_free(None)
+    return model, load_free, walk.physiological(load_free, None)
