@@ -33,31 +33,32 @@ from jaxclamp.energies import (
 )
 from jaxclamp.meshes import Mesh
 from jaxclamp.pytree import record, static
-from jaxclamp.tensors import Tensor, det, pointwise_derivatives
+from jaxclamp.tensors import Tensor, det, pointwise_derivatives, total
 
 PAIRS = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
 
+AnyArray = Array | np.ndarray
 Density = Callable[[Tensor], Array]
 
 
-def at_points(stencil: Array, x: Array) -> Array:
+def at_points(stencil: AnyArray, x: Array) -> Array:
     """y_c = sum_a S[q, c, a] x_a at every point: (n_c, 3, n_q, n_cells).
 
     stencil: (n_q, n_c, n_en); x: positions of the cells' nodes, (n_en, 3, n_cells)
     """
     n_q, n_c, n_en = stencil.shape
-    y = stencil.reshape(n_q * n_c, n_en) @ x.reshape(n_en, -1)
+    y = jnp.matmul(jnp.reshape(stencil, (n_q * n_c, n_en)), x.reshape(n_en, -1))
     return jnp.moveaxis(y.reshape(n_q, n_c, 3, -1), 0, 2)
 
 
-def to_nodes(stencil: Array, dy: Array) -> Array:
+def to_nodes(stencil: AnyArray, dy: Array) -> Array:
     """The transpose of `at_points`: (n_c, 3, n_q, n_cells) to (n_en, 3, n_cells)."""
     n_q, n_c, n_en = stencil.shape
     flat = jnp.moveaxis(dy, 2, 0).reshape(n_q * n_c, -1)
-    return (stencil.reshape(n_q * n_c, n_en).T @ flat).reshape(n_en, 3, -1)
+    return (jnp.reshape(stencil, (n_q * n_c, n_en)).T @ flat).reshape(n_en, 3, -1)
 
 
-def to_matrices(stencil: Array, moduli: Array) -> Array:
+def to_matrices(stencil: AnyArray, moduli: Array) -> Array:
     """Cell matrices from second derivatives at the points.
 
     moduli: d2/dy_ci dy_dj for the six PAIRS (i, j), (n_c, n_c, 6, n_q, n_cells)
@@ -68,7 +69,7 @@ def to_matrices(stencil: Array, moduli: Array) -> Array:
     return (products @ jnp.moveaxis(moduli, 3, 0).reshape(products.shape[1], -1)).reshape(n_en, n_en, 6, -1)
 
 
-def cell_derivatives(density: Density, stencil: Array, x: Array) -> tuple[Array, Array, Array]:
+def cell_derivatives(density: Density, stencil: AnyArray, x: Array) -> tuple[Array, Array, Array]:
     """Energy at the points (n_q, n_cells), cell vectors (n_en, 3, n_cells), cell matrices."""
     n_c = stencil.shape[1]
     y = at_points(stencil, x)
@@ -87,7 +88,7 @@ class Topology:
     cells: np.ndarray
     lumen_facets: np.ndarray
     outer_facets: np.ndarray
-    slots: tuple[np.ndarray, np.ndarray, np.ndarray]
+    slots: tuple[np.ndarray, ...]
     """where each entry of the matrices of cells, lumen and outer facets goes in the sparse values;
     the place behind the last one takes what belongs nowhere"""
     free: np.ndarray
@@ -202,12 +203,12 @@ class Linearisation:
     J_max: Array
 
 
-def _gather(x: Array, nodes: Array) -> Array:
+def _gather(x: Array, nodes: AnyArray) -> Array:
     """Positions of the cells' nodes, (n_en, 3, n_cells)."""
     return jnp.swapaxes(x[nodes], 1, 2)
 
 
-def _scatter(nodes: Array, values: Array, n_nodes: int) -> Array:
+def _scatter(nodes: AnyArray, values: Array, n_nodes: int) -> Array:
     """Sum of cell vectors (n_en, 3, n_cells) at the nodes, (n_nodes, 3)."""
     return jnp.zeros((n_nodes, 3)).at[nodes].add(jnp.swapaxes(values, 1, 2))
 
@@ -217,7 +218,7 @@ def _wall_densities(body: Body, p: Array) -> list[tuple[int, int, Density]]:
     g, materials = body.geometry, body.parameters.materials
     at_point = jnp.einsum("mq,mc->qc", body.stencils.modes, p)
     ranges = body.topology.layer_cells
-    runs = []
+    runs: list[tuple[int, int, Density]] = []
     for first, last in material_groups(materials):
         start, stop = ranges[first][0], ranges[last - 1][1]
         counts = tuple(b - a for a, b in ranges[first:last])
@@ -261,7 +262,7 @@ def potential(body: Body, x: Array, jaw_height: Array, pressure: Array) -> Array
     dilatation = _dilatation(body, dx_dxi)
     volumetric = 0.5 * jnp.sum(dilatation * _condensed_pressure(body, dilatation))
     zero = jnp.zeros_like(dilatation)
-    wall = sum(
+    wall = total(
         jnp.sum(density(dx_dxi[..., start:stop])) for start, stop, density in _wall_densities(body, zero)
     )
     lumen = jnp.sum(
@@ -303,10 +304,10 @@ def linearise(body: Body, state: State, pressure: Array) -> Linearisation:
     slope = jax.grad(lambda y: jnp.sum(dilatation_density(y, g.to_local, g.dV)))(dx_dxi)
     modes = [to_nodes(st.wall, slope * mode[:, None]) for mode in st.modes]
     stiff_modes = [
-        sum(g.pressure_stiffness[m, n] * modes[n] for n in range(len(modes))) for m in range(len(modes))
+        total([g.pressure_stiffness[m, n] * mode for n, mode in enumerate(modes)]) for m in range(len(modes))
     ]
-    wall_force = wall_force + sum(mode * missing[m] for m, mode in enumerate(modes))
-    wall_matrix = wall_matrix + sum(
+    wall_force = wall_force + total([mode * missing[m] for m, mode in enumerate(modes)])
+    wall_matrix = wall_matrix + total(
         jnp.stack([a[:, None, i] * b[None, :, j] for i, j in PAIRS], axis=2)
         for a, b in zip(modes, stiff_modes, strict=True)
     )
@@ -322,7 +323,7 @@ def linearise(body: Body, state: State, pressure: Array) -> Linearisation:
     values = jnp.zeros(top.n_nonzeros + 1)
     for slots, matrix in zip(top.slots, (wall_matrix, lumen_k, jaw_k), strict=True):
         values = values.at[slots].add(matrix.ravel(), mode="promise_in_bounds")
-    total = (
+    force = (
         _scatter(top.cells, wall_force, n_nodes)
         + _scatter(top.lumen_facets, lumen_f, n_nodes)
         + _scatter(top.outer_facets, jaw_f, n_nodes)
@@ -334,9 +335,9 @@ def linearise(body: Body, state: State, pressure: Array) -> Linearisation:
     )
     J = det(dx_dxi) * det(g.to_local)
     return Linearisation(
-        energy=sum(energies) + volumetric + jnp.sum(lumen_e) + jnp.sum(jaw_e),
-        residual=total[top.free],
-        reactions=jnp.linalg.norm(total.at[top.free].set(0.0)),
+        energy=total(energies) + volumetric + jnp.sum(lumen_e) + jnp.sum(jaw_e),
+        residual=force[top.free],
+        reactions=jnp.linalg.norm(force.at[top.free].set(0.0)),
         volume_error=jnp.max(jnp.abs(jnp.einsum("mq,mc->qc", st.modes, missing)) * _compliance(body)),
         values=values[:-1],
         jaw_force=-along_height,

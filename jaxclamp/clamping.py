@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
-import platform
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -32,9 +30,10 @@ from jaxclamp.equilibrium import (
     stretched,
 )
 from jaxclamp.linear_solvers import LinearSolver
-from jaxclamp.measures import PARTS_OF_A_JAW, PEAK_SHARPNESS, observe
+from jaxclamp.measures import PARTS_OF_A_JAW, observe
 from jaxclamp.meshes import closed_positions
-from jaxclamp.model import SYMMETRY, Model, build_model, terms
+from jaxclamp.model import Model, build_model
+from jaxclamp.results import Kept, Result, work_balance
 from jaxclamp.scene import ForceStop, OcclusionStop, Scene, TravelStop
 
 FIRST_TOUCH = 0.02
@@ -51,147 +50,12 @@ LOAD_STEP = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
-class Kept:
-    """One converged state and what was read off it."""
-
-    stage: str
-    equilibrium: Equilibrium
-    values: dict[str, Any]
-    """as in result.json: floats, and one dict per layer for peaks"""
-
-    @property
-    def state(self) -> State:
-        """Positions, pressures and jaw height."""
-        return self.equilibrium.state
-
-
-@dataclasses.dataclass(frozen=True)
 class Progress:
     """Where a clamping stands."""
 
     stage: str
     fraction: float
     message: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Result:
-    """Every converged state of a clamping."""
-
-    model: Model
-    states: tuple[Kept, ...]
-    """load-free, physiological, then closing, in order"""
-    failure: EquilibriumError | None
-    solver: dict[str, Any]
-    cost: dict[str, Any]
-
-    @property
-    def scene(self) -> Scene:
-        return self.model.scene
-
-    @property
-    def converged(self) -> bool:
-        """True if the stop was reached."""
-        return self.failure is None
-
-    def _stage(self, stage: str) -> list[Kept]:
-        return [kept for kept in self.states if kept.stage == stage]
-
-    @property
-    def load_free(self) -> Kept | None:
-        return next(iter(self._stage("load-free")), None)
-
-    @property
-    def physiological(self) -> Kept | None:
-        return next(iter(self._stage("physiological")), None)
-
-    @property
-    def closing(self) -> list[Kept]:
-        """The physiological state and all states with the jaws on the artery."""
-        return self._stage("physiological") + self._stage("clamping")
-
-    @property
-    def history(self) -> list[dict[str, Any]]:
-        """One record per converged state from the physiological one on."""
-        return [self._relative(kept) for kept in self.closing]
-
-    @property
-    def final(self) -> dict[str, Any]:
-        """The record of the last converged state; None everywhere if there is none with the jaws closing."""
-        return self.history[-1] if self.history else {}
-
-    def _relative(self, kept: Kept) -> dict[str, Any]:
-        """A state's record, with the quantities that refer to the physiological state."""
-        assert self.physiological is not None
-        base, v = self.physiological.values, kept.values
-        travel = max(base["outer_radius_mm"] - v["jaw_height_mm"], 0.0) if kept.stage == "clamping" else 0.0
-        relative = {
-            "stage": kept.stage,
-            "jaw_travel_mm": travel,
-            "occlusion": 1.0 - v["lumen_height_mm"] / base["lumen_height_mm"],
-            "area_occlusion": 1.0 - v["lumen_area_mm2"] / base["lumen_area_mm2"],
-            "axial_stress_ratio_at_P": _ratio(v["axial_stress_at_P_kPa"], base["axial_stress_at_P_kPa"]),
-            "circumferential_stress_ratio_at_P": _ratio(
-                v["circumferential_stress_at_P_kPa"], base["circumferential_stress_at_P_kPa"]
-            ),
-            "negative_pivots": kept.equilibrium.negative_pivots,
-            "snapped": kept.equilibrium.snapped,
-            "newton_iterations": kept.equilibrium.iterations,
-        }
-        return relative | {key: value for key, value in v.items() if key != "jaw_height_mm"}
-
-    def to_dict(self) -> dict[str, Any]:
-        """The content of result.json."""
-        scene = self.scene
-        load_free, base = self.load_free, self.physiological
-        return {
-            "title": scene.title,
-            "converged": self.converged,
-            "failure": None if self.failure is None else str(self.failure),
-            "load_free": {
-                "lumen_radius_mm": _radius(load_free),
-                "outer_radius_mm": load_free and load_free.values["outer_radius_mm"],
-            },
-            "physiological": {
-                "lumen_radius_mm": _radius(base),
-                "outer_radius_mm": base and base.values["outer_radius_mm"],
-                "axial_stress_at_P_kPa": base and base.values["axial_stress_at_P_kPa"],
-                "circumferential_stress_at_P_kPa": base and base.values["circumferential_stress_at_P_kPa"],
-            },
-            "final": self.final,
-            "history": self.history,
-            "model": {
-                "symmetry": SYMMETRY,
-                "elements": self.model.mesh.n_cells,
-                "element": scene.mesh.element,
-                "unknowns": self.model.pattern.n,
-                "terms": terms(scene),
-                "peak_sharpness": PEAK_SHARPNESS,
-            },
-            "solver": self.solver,
-            "cost": self.cost,
-            "versions": versions(),
-        }
-
-
-def _radius(kept: Kept | None) -> float | None:
-    return None if kept is None else 0.5 * kept.values["lumen_height_mm"]
-
-
-def _ratio(value: float, base: float) -> float | None:
-    return value / base if base != 0.0 else None
-
-
-def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
-    names = ("jaxclamp", "jax", "jaxlib", "numpy", "scipy")
-    found = {"python": platform.python_version()}
-    for name in names:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 class _Walk:
@@ -201,7 +65,6 @@ class _Walk:
         self.model, self.report = model, report
         self.states: list[Kept] = []
         self.start = time.perf_counter()
-        self.compile_seconds = 0.0
         settings = model.scene.solver
         self.system = System(
             body=model.body,
@@ -248,7 +111,7 @@ class _Walk:
         if guess is not None:
             guess = stretched(guess, stretch * self.model.half_length)
             try:
-                equilibrium = newton(self.system, guess, pressure, stretch, Held(self.far))
+                equilibrium = newton(self.system, guess, path(1.0))
             except NotConverged:
                 equilibrium = None
         if equilibrium is None:
@@ -312,9 +175,9 @@ class _Walk:
         if height <= target:
             reason = f"{force * PARTS_OF_A_JAW * 1e-3:.3g} N is all it takes to {NEARLY_CLOSED:.0%} occlusion"
             raise self.error("clamping", now, NotConverged(reason))
-        return (lambda s: self.lumen(height + s * (target - height))), lambda e: (
-            float(e.lin.jaw_force) > 0.7 * wanted
-        )
+        return (
+            lambda s: self.lumen(height + s * (target - height))
+        ), lambda e: float(e.lin.jaw_force) > 0.7 * wanted
 
     # --- pieces ---------------------------------------------------------------------------------
 
@@ -350,6 +213,12 @@ class _Walk:
         return float(equilibrium.state.x[self.model.marks.lumen_top, 1])
 
     def tell_closing(self, s: float, equilibrium: Equilibrium) -> None:
+        """Keep a closing state; refuse one in which the intima would have passed the mid-plane."""
+        if self.top(equilibrium) <= 0.0:
+            reason = NotConverged(
+                "the lumen closes before the stop, and contact of the intima is not modelled"
+            )
+            raise self.error("clamping", self.states[-1].equilibrium, reason)
         occlusion = 1.0 - self.top(equilibrium) / self.lumen_radius
         force = float(equilibrium.lin.jaw_force) * PARTS_OF_A_JAW * 1e-3
         note = ", snapped" if equilibrium.snapped else ""
@@ -398,7 +267,7 @@ class _Walk:
     def solve_or_descend(self, stage: str, start: State, step: Step, load: str) -> Equilibrium:
         """Newton, and if that fails the way downhill."""
         try:
-            return newton(self.system, start, step.pressure, step.axial_stretch, step.closing)
+            return newton(self.system, start, step)
         except NotConverged:
             try:
                 return descend(self.system, start, step)
@@ -431,11 +300,11 @@ def _to_floats(values: Any) -> Any:
     return jax.tree_util.tree_map(lambda leaf: np.asarray(leaf).tolist(), jax.device_get(values))
 
 
-def _reporter(progress: bool | Callable[[Progress], None] | None) -> Callable[[Progress], None]:
+def _reporter(progress: bool | Callable[[Progress], Any] | None) -> Callable[[Progress], Any]:
     if callable(progress):
         return progress
     if progress:
-        return lambda event: print(f"{event.stage:14s} {event.fraction:4.0%}  {event.message}", file=sys.stderr)
+        return lambda event: sys.stderr.write(f"{event.stage:14s} {event.fraction:4.0%}  {event.message}\n")
     return lambda event: None
 
 
@@ -487,7 +356,7 @@ def _warm(walk: _Walk, guess: Result) -> bool:
             walk.refer_to(new_base)
             closing = _closing_at_stop(walk, last)
             start = stretched(last.state, new_base.axial_stretch * walk.model.half_length)
-            found = newton(walk.system, start, new_base.pressure, new_base.axial_stretch, closing)
+            found = newton(walk.system, start, walk.step(closing))
         except (NotConverged, EquilibriumError):
             step = 0.5 * step
             if step < SMALLEST_SHARE:
@@ -524,37 +393,15 @@ def _result(walk: _Walk, failure: EquilibriumError | None) -> Result:
         "factorisations": system.solver.factorisations,
         "residual_mN": last.get("residual_mN"),
         "force_balance_error": last.get("force_balance_error"),
-        "work_balance_error": _work_balance(list(_closing_states(states))),
+        "work_balance_error": work_balance([kept for kept in states if kept.stage == "clamping"]),
         "snapped": any(kept.equilibrium.snapped for kept in states),
         "negative_pivots": states[-1].equilibrium.negative_pivots if states else None,
     }
     cost = {
         "wall_s": time.perf_counter() - walk.start,
         "compile_s": system.compile_seconds,
-        "assembly_s": system.assembly_seconds,
+        "assembly_s": system.assembly_seconds - system.compile_seconds,
         "factor_s": system.solver.factor_seconds,
         "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
     }
     return Result(walk.model, states, failure, solver, cost)
-
-
-def _closing_states(states: tuple[Kept, ...]) -> Iterator[Kept]:
-    return (kept for kept in states if kept.stage == "clamping")
-
-
-def _work_balance(closing: list[Kept]) -> float | None:
-    """Work of the jaws against the change of total energy over the closing, relative.
-
-    Between two states the force is integrated over the travel with its slopes at both ends
-    (Hermite, fourth order): W = h/2 (F0 + F1) + h**2/12 (F0' - F1').
-    """
-    if len(closing) < 3:
-        return None
-    work = 0.0
-    for a, b in zip(closing[:-1], closing[1:], strict=True):
-        down = float(a.state.jaw_height) - float(b.state.jaw_height)
-        forces = [float(k.equilibrium.lin.jaw_force) for k in (a, b)]
-        slopes = [-k.equilibrium.force_slope for k in (a, b)]
-        work += down / 2.0 * sum(forces) + down**2 / 12.0 * (slopes[0] - slopes[1])
-    change = float(closing[-1].equilibrium.lin.energy) - float(closing[0].equilibrium.lin.energy)
-    return abs(work - change) / max(abs(change), 1e-12)

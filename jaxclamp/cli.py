@@ -138,7 +138,7 @@ def show(
 ) -> None:
     """Check a scene and say what would be modelled; solves nothing."""
     loaded = _load(scene, fidelity, overrides, quiet=False)
-    from jaxclamp.clamping import describe
+    from jaxclamp.model import describe
 
     described = describe(loaded)
     if as_json:

@@ -26,7 +26,10 @@ MAX_NEWTON = 14
 MAX_CUTS = 2
 DIVERGING = 4.0
 MAX_DESCENT = 150
-EASY_ITERATIONS = 6
+MAX_SHIFTS = 30
+SUFFICIENT_FALL = 1e-4
+GOOD_MODEL = 0.3
+EASY_ITERATIONS = 5
 """a step that converged in so many iterations lets the next one grow"""
 LARGEST_MOVE = 0.25
 """a Newton correction moves no node further than this part of the lumen radius"""
@@ -125,6 +128,7 @@ class Step:
 Path = Callable[[float], Step]
 """load parameter, 0 to 1 -> what to solve for"""
 
+
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
     """A converged state with its loads and what was seen on the way."""
@@ -138,6 +142,8 @@ class Equilibrium:
     """of the tangent at a held jaw; more than 0: unstable without the stop; None: back end cannot tell"""
     force_slope: float
     """d jaw_force / d jaw_height at equilibrium, mN/mm"""
+    responses: np.ndarray
+    """change of the free unknowns to remove the residual, and per unit of jaw height, (n_free, 2)"""
     iterations: int
     snapped: bool = False
     """reached by following the potential downhill past a loss of stability"""
@@ -157,23 +163,31 @@ class System:
     newton_iterations: int = 0
     load_steps: int = 0
     assembly_seconds: float = 0.0
-    compile_seconds: float = 0.0
+    first_seconds: float = 0.0
+    linearisations: int = 0
 
     def linearise(self, state: State, pressure: float) -> Linearisation:
-        """Forces and tangent, on the host."""
-        start, compiled = time.perf_counter(), linearise._cache_size()
-        lin = jax.device_get(linearise(self.body, state, jnp.asarray(pressure)))
+        """Forces and tangent, on the host (numpy arrays)."""
+        start = time.perf_counter()
+        lin: Linearisation = jax.device_get(linearise(self.body, state, jnp.asarray(pressure)))
         seconds = time.perf_counter() - start
-        if linearise._cache_size() > compiled:
-            self.compile_seconds += seconds
-        else:
-            self.assembly_seconds += seconds
+        if self.linearisations == 0:
+            self.first_seconds = seconds
+        self.linearisations += 1
+        self.assembly_seconds += seconds
         return lin
+
+    @property
+    def compile_seconds(self) -> float:
+        """What the first assembly took beyond a usual one: compilation, if it was needed, s."""
+        usual = (self.assembly_seconds - self.first_seconds) / max(self.linearisations - 1, 1)
+        return max(self.first_seconds - usual, 0.0)
 
 
 def residual_norm(lin: Linearisation) -> float:
-    """Largest-meaningful measure of imbalance: the norm of the free forces, mN."""
-    return float(np.linalg.norm(lin.residual))
+    """Norm of the free forces, mN; inf where they are not finite or beyond reason."""
+    largest = float(np.max(np.abs(lin.residual), initial=0.0))
+    return float(np.linalg.norm(lin.residual)) if largest < 1e150 else math.inf
 
 
 def _converged(system: System, lin: Linearisation, closing_error: float) -> bool:
@@ -195,125 +209,167 @@ def _sound(lin: Linearisation) -> bool:
 
 
 def _bordered_step(
-    system: System, lin: Linearisation, closing: Closing, error: float
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Newton step (dx, d_height) of equilibrium and closing condition; also dx per unit of height."""
-    both = system.solver.solve(np.stack([-lin.residual, -lin.jaw_coupling], axis=1))
-    free, per_height = both[:, 0], both[:, 1]
+    responses: np.ndarray, lin: Linearisation, closing: Closing, error: float
+) -> tuple[np.ndarray, float]:
+    """Newton step (dx, d_height) of equilibrium and closing condition."""
+    free, per_height = responses[:, 0], responses[:, 1]
     slope = closing.jaw_slope(lin) + closing.change(lin, per_height)
     if slope == 0.0 or not math.isfinite(slope):
         raise NotConverged("the jaw does not touch the artery")
     d_height = -(error + closing.change(lin, free)) / slope
-    return free + d_height * per_height, d_height, per_height
+    return free + d_height * per_height, d_height
 
 
 def newton(
-    system: System, state: State, pressure: float, axial_stretch: float, closing: Closing
+    system: System,
+    state: State,
+    step: Step,
+    known: Equilibrium | None = None,
 ) -> Equilibrium:
-    """Solve for equilibrium and the closing condition from a nearby state. Raises NotConverged."""
-    if isinstance(closing, Held):
+    """Solve for equilibrium and the closing condition from a nearby state. Raises NotConverged.
+
+    known: an equilibrium whose tangent is not formed again if `state` is its state
+    """
+    closing, pressure = step.closing, step.pressure
+    if isinstance(closing, Held) and float(state.jaw_height) != closing.height:
         state = dataclasses.replace(state, jaw_height=jnp.asarray(closing.height))
-    lin = system.linearise(state, pressure)
+    reuse = known if known is not None and known.state is state and known.pressure == pressure else None
+    lin = system.linearise(state, pressure) if reuse is None else reuse.lin
     if not _sound(lin):
         raise NotConverged("the predicted state is inverted", residual_norm(lin), float(lin.J_min))
     cuts, first_norm = 0, math.inf
     for iteration in range(MAX_NEWTON + 1):
         error = closing.error(state, lin)
-        norm = residual_norm(lin)
-        try:
-            negative = system.solver.factor(lin.values)
-            done = _converged(system, lin, error)
-            dx, d_height, per_height = _bordered_step(system, lin, closing, error)
-        except Singular as failure:
-            raise NotConverged(str(failure), norm, float(lin.J_min)) from failure
-        if done:
-            slope = -float(lin.jaw_stiffness) - float(np.dot(lin.jaw_coupling, per_height))
+        negative, responses = (
+            _factored(system, lin) if reuse is None else (reuse.negative_pivots, reuse.responses)
+        )
+        reuse = None
+        if _converged(system, lin, error):
+            slope = -float(lin.jaw_stiffness) - float(np.dot(lin.jaw_coupling, responses[:, 1]))
             return Equilibrium(
-                state, pressure, axial_stretch, lin, negative, slope, iterations=iteration
+                state, pressure, step.axial_stretch, lin, negative, slope, responses, iteration
             )
-        if iteration == MAX_NEWTON:
-            break
+        dx, d_height = _bordered_step(responses, lin, closing, error)
         system.newton_iterations += 1
-        largest = float(np.max(np.abs(dx)))
-        fraction = min(1.0, LARGEST_MOVE * system.length / max(largest, abs(d_height), 1e-300))
-        while True:
-            trial = advance(system.body, state, dx, d_height, fraction)
-            trial_lin = system.linearise(trial, pressure)
-            if _sound(trial_lin) and residual_norm(trial_lin) <= LARGEST_GROWTH * float(lin.reactions):
-                break
-            fraction *= 0.4
-            cuts += 1
-            if cuts > MAX_CUTS:
-                raise NotConverged("no admissible step", norm, float(lin.J_min))
-        state, lin = trial, trial_lin
-        if iteration == 0:
-            first_norm = residual_norm(lin)
-        if iteration > 1 and residual_norm(lin) > DIVERGING * first_norm:
-            raise NotConverged("Newton's residual grows", residual_norm(lin), float(lin.J_min))
+        state, lin, shortened = _admissible(system, state, lin, pressure, dx, d_height, MAX_CUTS - cuts)
+        cuts += shortened
+        norm = residual_norm(lin)
+        first_norm = norm if iteration == 0 else first_norm
+        if iteration > 1 and norm > DIVERGING * first_norm:
+            raise NotConverged("Newton's residual grows", norm, float(lin.J_min))
     raise NotConverged(f"{MAX_NEWTON} Newton iterations", residual_norm(lin), float(lin.J_min))
+
+
+def _factored(system: System, lin: Linearisation) -> tuple[int | None, np.ndarray]:
+    """Negative eigenvalues of the tangent, and both responses (n_free, 2). Raises NotConverged."""
+    try:
+        negative = system.solver.factor(np.asarray(lin.values))
+        both = np.stack([-np.asarray(lin.residual), -np.asarray(lin.jaw_coupling)], axis=1)
+        return negative, system.solver.solve(both)
+    except Singular as failure:
+        raise NotConverged(str(failure), residual_norm(lin), float(lin.J_min)) from failure
+
+
+def _admissible(
+    system: System,
+    state: State,
+    lin: Linearisation,
+    pressure: float,
+    dx: np.ndarray,
+    d_height: float,
+    cuts_left: int,
+) -> tuple[State, Linearisation, int]:
+    """Go along a Newton step, shortened until no cell inverts and no force explodes.
+
+    Returns the new state, its linearisation and how often the step was cut. Raises NotConverged
+    after `cuts_left` cuts.
+    """
+    largest = max(float(np.max(np.abs(dx))), abs(d_height), 1e-300)
+    fraction = min(1.0, LARGEST_MOVE * system.length / largest)
+    for cut in range(cuts_left + 1):
+        trial = advance(system.body, state, dx, d_height, fraction)
+        trial_lin = system.linearise(trial, pressure)
+        if _sound(trial_lin) and residual_norm(trial_lin) <= LARGEST_GROWTH * float(lin.reactions):
+            return trial, trial_lin, cut
+        fraction *= 0.4
+    raise NotConverged("no admissible step", residual_norm(lin), float(lin.J_min))
 
 
 def descend(system: System, state: State, step: Step) -> Equilibrium:
     """Go down the potential at a held jaw to a stable equilibrium. Raises NotConverged.
 
-    Steps solve (K + shift * C) dx = -residual, with C the diagonal of the tangent without its
-    volumetric stiffness' scale (a uniform stiffness); the shift rises until the matrix is positive
-    definite and the potential falls, and shrinks where the model predicts well (a trust region in
-    all but name). With the shift at zero this is Newton's method.
+    Steps solve (K + shift I) dx = -residual. The shift rises until the matrix is positive definite
+    and the potential falls enough, and shrinks where the quadratic model predicts well (a trust
+    region in all but name). With the shift at zero this is Newton's method.
     """
     assert isinstance(step.closing, Held)
-    pressure = step.pressure
     state = dataclasses.replace(state, jaw_height=jnp.asarray(step.closing.height))
-    lin = system.linearise(state, pressure)
+    lin = system.linearise(state, step.pressure)
     if not _sound(lin):
         raise NotConverged("the predicted state is inverted", residual_norm(lin), float(lin.J_min))
-    unit = float(np.median(lin.values[system.diagonal])) * 1e-3
-    shift, snapped = 0.0, False
+    unit = 1e-3 * float(np.median(lin.values[system.diagonal]))
+    shift, unstable = 0.0, False
     for iteration in range(MAX_DESCENT):
         if _converged(system, lin, 0.0):
-            equilibrium = newton(system, state, pressure, step.axial_stretch, step.closing)
-            return dataclasses.replace(equilibrium, iterations=iteration, snapped=snapped)
-        accepted = False
-        for _ in range(30):
-            values = lin.values.copy()
-            values[system.diagonal] += shift
-            try:
-                negative = system.solver.factor(values)
-                dx = system.solver.solve(-lin.residual[:, None])[:, 0]
-            except Singular:
-                negative, dx = 1, np.zeros_like(lin.residual)
-            downhill = float(np.dot(lin.residual, dx))
-            if negative or downhill >= 0.0:
-                snapped = True
-                shift = max(4.0 * shift, unit)
-                continue
-            system.newton_iterations += 1
-            fraction = min(1.0, LARGEST_MOVE * system.length / float(np.max(np.abs(dx))))
-            trial = advance(system.body, state, dx, 0.0, fraction)
-            trial_lin = system.linearise(trial, pressure)
-            gain = float(lin.energy) - float(trial_lin.energy)
-            noise = 1e-13 * abs(float(lin.energy))
-            if _sound(trial_lin) and (
-                gain >= -1e-4 * downhill * fraction - noise
-                or residual_norm(trial_lin) < 0.3 * residual_norm(lin)
-            ):
-                accepted = True
-                break
+            equilibrium = newton(system, state, step)
+            return dataclasses.replace(equilibrium, iterations=iteration, snapped=unstable)
+        for _ in range(MAX_SHIFTS):
+            dx = _downhill_step(system, lin, shift)
+            if dx is None:
+                unstable = True
+            else:
+                trial, trial_lin, quality = _go_down(system, state, lin, step.pressure, dx)
+                if quality > 0.0:
+                    break
             shift = max(4.0 * shift, unit)
-        if not accepted:
+        else:
             break
-        if gain >= -0.3 * downhill * fraction or residual_norm(trial_lin) < 0.3 * residual_norm(lin):
+        if quality > GOOD_MODEL:
             shift = 0.25 * shift if shift > unit else 0.0
         state, lin = trial, trial_lin
     raise NotConverged("the descent did not end", residual_norm(lin), float(lin.J_min))
 
 
-FIRST_STEP, SMALLEST_STEP, LARGEST_STEP = 0.1, 0.1 / 32, 0.18
+def _downhill_step(system: System, lin: Linearisation, shift: float) -> np.ndarray | None:
+    """-(K + shift I)^-1 residual, (n_free,); None if that matrix is not positive definite."""
+    values = np.array(lin.values)
+    values[system.diagonal] += shift
+    try:
+        negative = system.solver.factor(values)
+        dx = system.solver.solve(-np.asarray(lin.residual)[:, None])[:, 0]
+    except Singular:
+        return None
+    return None if negative or np.dot(lin.residual, dx) >= 0.0 else dx
+
+
+def _go_down(
+    system: System, state: State, lin: Linearisation, pressure: float, dx: np.ndarray
+) -> tuple[State, Linearisation, float]:
+    """Go along a downhill step; how well the fall agrees with the prediction, 0 or less if refused.
+
+    Close to equilibrium, where the fall drowns in rounding, a smaller residual is accepted instead.
+    """
+    system.newton_iterations += 1
+    fraction = min(1.0, LARGEST_MOVE * system.length / float(np.max(np.abs(dx))))
+    trial = advance(system.body, state, dx, 0.0, fraction)
+    trial_lin = system.linearise(trial, pressure)
+    if not _sound(trial_lin):
+        return state, lin, -1.0
+    if residual_norm(trial_lin) < 0.3 * residual_norm(lin):
+        return trial, trial_lin, 1.0
+    predicted = -float(np.dot(lin.residual, dx)) * fraction
+    fall = float(lin.energy) - float(trial_lin.energy)
+    return trial, trial_lin, fall / predicted - SUFFICIENT_FALL
+
+
+FIRST_STEP, SMALLEST_STEP, LARGEST_STEP = 0.12, 0.12 / 32, 0.15
 
 
 def stretched(state: State, end_height: float) -> State:
     """The state with all axial positions scaled so that the end plane is at `end_height`, mm."""
     z = state.x[:, 2]
+    if abs(float(jnp.max(z)) - end_height) <= 1e-14 * end_height:
+        return state
     return dataclasses.replace(state, x=state.x.at[:, 2].set(z * (end_height / jnp.max(z))))
 
 
@@ -343,7 +399,7 @@ def follow(
         wanted = path(target)
         guess = stretched(equilibrium.state, wanted.axial_stretch * half_length)
         try:
-            found = newton(system, guess, wanted.pressure, wanted.axial_stretch, wanted.closing)
+            found = newton(system, guess, wanted, equilibrium)
         except NotConverged as error:
             failure, step = error, 0.4 * (target - s)
             continue
@@ -354,6 +410,6 @@ def follow(
             break
         if found.iterations <= EASY_ITERATIONS:
             step = min(1.3 * step, max(LARGEST_STEP, first_step))
-        elif found.iterations > 1.5 * EASY_ITERATIONS:
+        elif found.iterations > EASY_ITERATIONS + 2:
             step = 0.7 * step
     return s, equilibrium, None

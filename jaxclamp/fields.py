@@ -133,17 +133,12 @@ def whole(layer: LayerFields) -> LayerFields:
 
     turned = _turned(layer.element)
     cells = np.concatenate(
-        [
-            numbers[o][layer.cells if np.prod(signs[o]) > 0 else layer.cells[turned]]
-            for o in range(8)
-        ],
+        [numbers[o][layer.cells if np.prod(signs[o]) > 0 else layer.cells[turned]] for o in range(8)],
         axis=1,
     )
     data = {name: v[source] * (sign if v.ndim == 2 else 1) for name, v in layer.point_data.items()}
     cell_data = {name: np.tile(v, 8) for name, v in layer.cell_data.items()}
-    return LayerFields(
-        layer.name, layer.element, layer.points[source] * sign, cells, data, cell_data, None
-    )
+    return LayerFields(layer.name, layer.element, layer.points[source] * sign, cells, data, cell_data, None)
 
 
 def _turned(element: Element) -> np.ndarray:
@@ -165,7 +160,6 @@ def spread(positions: Sequence[float], count: int) -> list[int]:
 _gap = jax.jit(lambda jaw, point: jaw.gap(point))
 
 
-
 def jaw_outline(jaw: Jaw, height: float, n: int = 301) -> np.ndarray:
     """Closed curve (z, y) where the gap is zero, mm, (n_points, 2), first point repeated at the end.
 
@@ -180,8 +174,8 @@ def jaw_outline(jaw: Jaw, height: float, n: int = 301) -> np.ndarray:
     y = np.linspace(-extent, top + 0.1 * extent, n)
     zz, yy = np.meshgrid(z, y)
     gap = _gap(jaw, (jnp.zeros_like(zz), jnp.asarray(yy), jnp.asarray(zz)))
-    curves = contour_generator(z, y, np.maximum(gap, yy - top)).lines(0.0)
-    return np.asarray(max(curves, key=len))
+    curves = [np.asarray(c) for c in contour_generator(z, y, np.maximum(gap, yy - top)).lines(0.0)]
+    return max(curves, key=len)
 
 
 def jaw_height_shown(model: Model, state: State, open_height: float | None) -> float:

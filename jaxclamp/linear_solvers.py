@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -36,34 +37,52 @@ class BackEnd(Protocol):
 
 
 class _Pardiso:
-    """MKL PARDISO, L D L' with Bunch-Kaufman pivots (py-mkl-pardiso)."""
+    """MKL PARDISO (py-mkl-pardiso): Cholesky while the tangent is definite, else L D L'.
+
+    Cholesky takes 60 % of the time of L D L' and fails at once on an indefinite matrix. After a
+    failure the next few matrices go to L D L' directly.
+    """
 
     def __init__(self, pattern: Pattern) -> None:
         self._pattern = pattern
-        self._solver = None
+        self._solvers: dict[int, Any] = {}
+        self._indefinite_for = 0
 
     def factor(self, values: np.ndarray) -> int | None:
         import pymklpardiso
 
         if not np.all(np.isfinite(values)):
             raise Singular("the tangent is not finite")
+        if self._indefinite_for == 0:
+            try:
+                self._current = self._factored(pymklpardiso.MTYPE_REAL_SYM_POSDEF, values)
+                return 0
+            except RuntimeError:
+                self._indefinite_for = 3
+        self._indefinite_for -= 1
         try:
-            if self._solver is None:
-                n = self._pattern.n
-                matrix = sp.csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(n, n))
-                self._solver = pymklpardiso.PardisoSolver(
-                    matrix, pymklpardiso.MTYPE_REAL_SYM_INDEF, iparms=_PARDISO_SETTINGS
-                )
-            else:
-                self._solver.refactor(values)
+            self._current = self._factored(pymklpardiso.MTYPE_REAL_SYM_INDEF, values)
         except RuntimeError as error:
             raise Singular(str(error)) from error
-        if self._solver.get_iparm_value(13) > 0:
+        if self._current.get_iparm_value(13) > 0:
             raise Singular("the tangent is singular to working precision")
-        return int(self._solver.get_iparm_value(22))
+        return int(self._current.get_iparm_value(22))
+
+    def _factored(self, kind: int, values: np.ndarray) -> Any:
+        import pymklpardiso
+
+        solver = self._solvers.get(kind)
+        if solver is None:
+            n = self._pattern.n
+            matrix = sp.csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(n, n))
+            solver = pymklpardiso.PardisoSolver(matrix, kind, iparms=_PARDISO_SETTINGS)
+            self._solvers[kind] = solver
+        else:
+            solver.refactor(values)
+        return solver
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        return np.asarray(self._solver.solve(b))
+        return np.asarray(self._current.solve(b))
 
 
 # indices and meanings: oneMKL reference, pardiso iparm. No default start (0), METIS (1), no
@@ -77,7 +96,7 @@ class _Rslab:
 
     def __init__(self, pattern: Pattern) -> None:
         self._pattern = pattern
-        self._symbolic = None
+        self._symbolic: Any = None
 
     def _lower(self, values: np.ndarray) -> sp.csc_matrix:
         n = self._pattern.n  # the upper triangle by rows is the lower one by columns
@@ -131,7 +150,11 @@ def full_matrix(pattern: Pattern, values: np.ndarray) -> sp.csr_matrix:
     return (upper + sp.triu(upper, k=1).T).tocsr()
 
 
-BACK_ENDS = {"pardiso": (_Pardiso, "pymklpardiso"), "rslab": (_Rslab, "rslab"), "splu": (_SuperLU, "scipy")}
+BACK_ENDS: dict[str, tuple[Callable[[Pattern], BackEnd], str]] = {
+    "pardiso": (_Pardiso, "pymklpardiso"),
+    "rslab": (_Rslab, "rslab"),
+    "splu": (_SuperLU, "scipy"),
+}
 
 
 def available() -> list[str]:

@@ -10,7 +10,6 @@ circumferential and radial lines: the wall carries these directions with it when
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -23,7 +22,7 @@ from jaxclamp.elements import Element, gauss, lagrange, tensor_rule
 from jaxclamp.energies import material_groups, over_cells
 from jaxclamp.meshes import Mesh
 from jaxclamp.pytree import record, static
-from jaxclamp.tensors import cross, det, norm, product, smooth_maximum, stacked, transpose
+from jaxclamp.tensors import cross, det, norm, product, smooth_maximum, stacked, total, transpose
 
 PARTS = 8
 """the model is one eighth of the artery"""
@@ -109,8 +108,8 @@ def cauchy_stress(body: Body, state: State) -> tuple[dict[tuple[int, int], Array
 def along(F: dict[tuple[int, int], Array], sigma: Array, axis: int) -> Array:
     """Normal stress along the deformed image of a material axis (0 radial, 1 circumferential), kPa."""
     t = [F[i, axis] for i in range(3)]
-    squared_length = sum(component * component for component in t)
-    return sum(t[i] * sigma[i, j] * t[j] for i in range(3) for j in range(3)) / squared_length
+    squared_length = total(component * component for component in t)
+    return total(t[i] * sigma[i, j] * t[j] for i in range(3) for j in range(3)) / squared_length
 
 
 @record
@@ -163,7 +162,7 @@ def contact_pressure(body: Body, state: State, element: Element) -> tuple[Array,
     return pressure * body.geometry.dA / da, da
 
 
-@partial(jax.jit, static_argnames=())
+@jax.jit
 def observe(body: Body, state: State, pressure: Array, marks: Landmarks) -> dict[str, Any]:
     """Every number reported of one equilibrium, keys as in result.json, JAX scalars.
 
@@ -178,7 +177,7 @@ def observe(body: Body, state: State, pressure: Array, marks: Landmarks) -> dict
     touching = pressures > 0.0
     loaded_area = jnp.sum(jnp.where(touching, areas, 0.0))
 
-    total, force = jax.value_and_grad(potential, argnums=1)(body, state.x, state.jaw_height, pressure)
+    energy, force = jax.value_and_grad(potential, argnums=1)(body, state.x, state.jaw_height, pressure)
     free = force.ravel()[body.topology.free]
     jaw_force = -jax.grad(contact_potential, argnums=2)(body, state.x, state.jaw_height)
     pushed = pressure * _lifting(body, state)
@@ -195,7 +194,9 @@ def observe(body: Body, state: State, pressure: Array, marks: Landmarks) -> dict
         "clamp_force_N": 1e-3 * PARTS_OF_A_JAW * jaw_force,
         "max_contact_pressure_kPa": jnp.max(pressures),
         "mean_contact_pressure_kPa": jnp.where(
-            loaded_area > 0.0, jnp.sum(pressures * areas) / jnp.where(loaded_area > 0.0, loaded_area, 1.0), 0.0
+            loaded_area > 0.0,
+            jnp.sum(pressures * areas) / jnp.where(loaded_area > 0.0, loaded_area, 1.0),
+            0.0,
         ),
         "contact_area_mm2": PARTS_OF_A_JAW * loaded_area,
         "max_penetration_mm": jnp.maximum(jnp.max(-gap), 0.0),
@@ -203,7 +204,7 @@ def observe(body: Body, state: State, pressure: Array, marks: Landmarks) -> dict
         "circumferential_stress_at_P_kPa": marks.P_weights @ s.circumferential[:, marks.P_cell],
         "J_min": jnp.min(s.J),
         "J_max": jnp.max(s.J),
-        "total_energy_uJ": PARTS * total,
+        "total_energy_uJ": PARTS * energy,
         "residual_mN": jnp.linalg.norm(free),
         "force_balance_error": imbalance / jnp.maximum(jnp.abs(jaw_force), jnp.sum(pushed) + 1e-12),
     }

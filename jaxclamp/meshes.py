@@ -115,9 +115,9 @@ def build_mesh(settings: MeshSettings) -> Mesh:
         first_radial += count
         first_cell += nodes.shape[1]
 
-    z, c = np.meshgrid(np.arange(settings.axial), np.arange(settings.circumferential), indexing="ij")
-    local = element.facet_grid[:, :, None]
-    facet = lambda r: number(r, m * c.ravel() + local[:, 0], m * z.ravel() + local[:, 1])  # noqa: E731
+    along, around = np.meshgrid(np.arange(settings.axial), np.arange(settings.circumferential), indexing="ij")
+    corner = element.facet_grid[:, :, None]
+    facet = lambda r: number(r, m * around.ravel() + corner[:, 0], m * along.ravel() + corner[:, 1])  # noqa: E731
     return Mesh(
         element=element,
         grid=grid,
@@ -145,9 +145,14 @@ def _angles(mesh: Mesh, settings: MeshSettings) -> Array:
     return 0.5 * jnp.pi * _graded(mesh.grid[1], settings.circumferential_grading)
 
 
+def axial_fractions(mesh: Mesh, settings: MeshSettings) -> Array:
+    """Position of each axial grid line, 0 at the clamp to 1 at the end, (n_z,)."""
+    return _graded(mesh.grid[2], settings.axial_grading)
+
+
 def _heights(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """Load-free axial position of each axial grid line, mm, (n_z,)."""
-    return 0.5 * artery.length * _graded(mesh.grid[2], settings.axial_grading)
+    return 0.5 * artery.length * axial_fractions(mesh, settings)
 
 
 def sector_share(opening_angle: Array) -> Array:

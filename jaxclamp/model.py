@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxclamp.assembly import Body, Pattern, build_topology
+from jaxclamp.assembly import Body, Pattern, build_topology, supported
 from jaxclamp.energies import Parameters, build_geometry, build_stencils
+from jaxclamp.linear_solvers import available
 from jaxclamp.measures import Landmarks, find_landmarks
-from jaxclamp.meshes import Mesh, build_mesh
+from jaxclamp.meshes import Mesh, axial_fractions, build_mesh
 from jaxclamp.pytree import shape_of
 from jaxclamp.scene import Scene
 
@@ -86,3 +89,50 @@ def terms(scene: Scene) -> dict[str, str]:
         found["blood pressure"] = "follower load on the lumen, as enclosed volume"
     found["jaw contact"] = f"rigid '{scene.clamp.jaw.shape}' jaw against the outer wall, frictionless"
     return found
+
+
+SECONDS = {"q1p0": 1.4e-6, "q2p1": 4e-6}
+"""time of a clamping per unknown to the power 1.35 x 100 Newton iterations (measured; see the README)"""
+MEMORY_PER_UNKNOWN = 0.055
+"""MB, beside the 450 MB that Python and the compiled program take (measured)"""
+
+
+def describe(scene: Scene) -> dict[str, Any]:
+    """What would be modelled, and what it would cost; solves nothing."""
+    mesh = build_mesh(scene.mesh)
+    unknowns = 3 * mesh.n_nodes - int(supported(mesh).sum())
+    return {
+        "symmetry": SYMMETRY,
+        "layers": {
+            layer.name: f"{layer.material.law}, {count} elements through the thickness"
+            for layer, count in zip(scene.artery.layers, scene.mesh.radial, strict=True)
+        },
+        "terms": terms(scene),
+        "element": scene.mesh.element,
+        "elements": mesh.n_cells,
+        "unknowns": unknowns,
+        "stop": scene.stop.kind,
+        "continuation": scene.solver.continuation,
+        "linear_solver": available()[0]
+        if scene.solver.linear_solver == "auto"
+        else scene.solver.linear_solver,
+        "predicted_seconds": float(f"{3.0 + 100 * SECONDS[scene.mesh.element] * unknowns**1.35:.2g}"),
+        "predicted_memory_MB": float(f"{450.0 + MEMORY_PER_UNKNOWN * unknowns:.2g}"),
+        "warnings": warnings(scene, mesh),
+    }
+
+
+def warnings(scene: Scene, mesh: Mesh) -> list[str]:
+    """What the mesh cannot resolve."""
+    heights = 0.5 * float(scene.artery.length) * np.asarray(axial_fractions(mesh, scene.mesh))
+    jaw = scene.clamp.jaw
+    under = heights[:-1] <= float(jaw.half_extent())
+    widest = float(np.max(np.diff(heights)[under])) * float(scene.artery.axial_stretch)
+    radius = float(jaw.least_radius())
+    if widest > radius:
+        return [
+            f"the jaw's least radius of curvature is {radius:.3g} mm, and the facets under it are up to "
+            f"{widest:.3g} mm long: stress at its edges is not resolved "
+            "(use more axial elements, or a larger radius)"
+        ]
+    return []

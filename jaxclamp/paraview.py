@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -17,7 +17,7 @@ from jaxclamp.fields import jaw_height_shown, jaw_outline, layer_fields, whole
 from jaxclamp.meshes import Mesh
 
 if TYPE_CHECKING:
-    from jaxclamp.clamping import Kept, Result
+    from jaxclamp.results import Kept, Result
 
 INDEX = "clamping.pvd"
 FOLDER = "paraview"
@@ -30,7 +30,7 @@ SIDE_MARGIN = 1.15
 def write_states(
     result: Result, folder: Path, tell: Callable[[float, str], None] = lambda fraction, message: None
 ) -> list[Path]:
-    """Write all states into `folder`; returns the files, the index first."""
+    """Write all states into `folder`; returns the files, the index last."""
     import meshio
 
     (folder / FOLDER).mkdir(exist_ok=True)
@@ -48,7 +48,7 @@ def write_states(
             meshio.write(folder / name, made, compression="zlib")
             index.append((number, part, name))
     (folder / INDEX).write_text(pvd(index), encoding="utf-8")
-    return [folder / INDEX, *(folder / name for _, _, name in index)]
+    return [*(folder / name for _, _, name in index), folder / INDEX]
 
 
 def is_whole(mesh: Mesh) -> bool:
@@ -77,7 +77,7 @@ def pvd(index: list[tuple[int, str, str]]) -> str:
     )
 
 
-def artery_mesh(result: Result, kept: Kept, full: bool = True):  # type: ignore[no-untyped-def]
+def artery_mesh(result: Result, kept: Kept, full: bool = True) -> Any:
     """A state of the wall as a meshio mesh: one block of hexahedra, points doubled at interfaces."""
     import meshio
 
@@ -101,15 +101,15 @@ def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True):  # type: ignore[no-untyped-def]
-    """Both jaws of a state (the upper one beside the modelled eighth) as surfaces of quadrilaterals.
+def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True) -> Any:
+    """Both jaws of a state (only the upper one with the modelled eighth) as a meshio mesh of quadrilaterals.
 
     outline: closed curve (z, y) of the jaw, mm, from `jaw_outline`
     """
     import meshio
 
     physiological = result.physiological
-    open_height = physiological and physiological.values["outer_radius_mm"]
+    open_height = None if physiological is None else physiological.values["outer_radius_mm"]
     height = jaw_height_shown(result.model, kept.state, open_height)
     half_width = SIDE_MARGIN * _widest(result)
     z, y = outline[:-1].T

@@ -89,7 +89,8 @@ def engine(monkeypatch, tmp_path):
     """The command line with a stand-in for the solver, in an empty folder."""
     fake = Engine()
     clamping, export = types.ModuleType("jaxclamp.clamping"), types.ModuleType("jaxclamp.export")
-    clamping.clamp, clamping.describe, export.write_outputs = fake.clamp, fake.describe, fake.write_outputs
+    clamping.clamp, export.write_outputs = fake.clamp, fake.write_outputs
+    monkeypatch.setattr("jaxclamp.model.describe", fake.describe)
     monkeypatch.setitem(sys.modules, "jaxclamp.clamping", clamping)
     monkeypatch.setitem(sys.modules, "jaxclamp.export", export)
     monkeypatch.chdir(tmp_path)

@@ -29,15 +29,18 @@ LEVEL = {
     "equilibrium": 7,
     "model": 7,
     "sensitivity": 8,
-    "clamping": 9,
-    "fitting": 10,
-    "accuracy": 10,
-    "export": 10,
-    "plots": 10,
-    "report": 11,
-    "cli": 12,
-    "__init__": 13,
-    "__main__": 13,
+    "fields": 8,
+    "plots": 9,
+    "results": 10,
+    "clamping": 11,
+    "fitting": 12,
+    "accuracy": 12,
+    "paraview": 12,
+    "report": 12,
+    "export": 13,
+    "cli": 14,
+    "__init__": 15,
+    "__main__": 15,
 }
 
 MODULES = sorted(path.relative_to(PACKAGE).with_suffix("").parts for path in PACKAGE.rglob("*.py"))
@@ -46,7 +49,7 @@ MODULES = sorted(path.relative_to(PACKAGE).with_suffix("").parts for path in PAC
 CONFINED = {
     "matplotlib": {"plots", "report"},
     "pyvista": {"plots", "report"},
-    "meshio": {"export"},
+    "meshio": {"export", "paraview"},
     "typer": {"cli"},
     "optimize": {"cli"},
 }

@@ -14,7 +14,6 @@ from jaxclamp.plots.style import (
     FAINT,
     INK,
     NORMAL,
-    SMALL,
     THIRD,
     Picture,
     dress,
@@ -39,7 +38,14 @@ def plot_stress_at_P(result: Clamped) -> Picture:
     ):
         values = _column(history, key)
         axes.plot(
-            travel, values, color=colour, linestyle=line, marker=marker, markersize=3, linewidth=1.8, label=label
+            travel,
+            values,
+            color=colour,
+            linestyle=line,
+            marker=marker,
+            markersize=3,
+            linewidth=1.8,
+            label=label,
         )
         places = list(marked.values())
         axes.plot(
@@ -100,7 +106,9 @@ def plot_force_travel(result: Clamped) -> Picture:
         ("area_occlusion", "occlusion (area)", ":"),
     ):
         percent = [100.0 * value for value in _column(history, key)]
-        lines += second.plot(travel, percent, color=CIRCUMFERENTIAL, linestyle=style, linewidth=1.5, label=label)
+        lines += second.plot(
+            travel, percent, color=CIRCUMFERENTIAL, linestyle=style, linewidth=1.5, label=label
+        )
     dress(second, y="occlusion (%)", grid=False)
     second.spines["right"].set(visible=True, color=FAINT, linewidth=0.7)
     second.spines["left"].set_visible(False)
@@ -108,5 +116,5 @@ def plot_force_travel(result: Clamped) -> Picture:
     axes.yaxis.label.set_color(THIRD)
     second.yaxis.label.set_color(CIRCUMFERENTIAL)
     _letter_states(axes, travel, marked)
-    axes.legend(handles=lines, fontsize=SMALL, frameon=False, labelcolor=INK, loc="upper left")
+    legend(second, handles=lines, loc="upper left")
     return figure

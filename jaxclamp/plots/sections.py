@@ -29,9 +29,11 @@ def plot_sections(result: Clamped) -> Picture:
     up = 1.25 * high
     rows = -(-len(states) // COLUMNS)
     columns = min(COLUMNS, len(states))
-    scale = WIDTH / (COLUMNS * 2.0 * (across + along))
+    scale = 0.97 * WIDTH / (COLUMNS * 2.0 * (across + along))
     figure = Picture(WIDTH * columns / COLUMNS + 0.2, rows * (2.0 * up * scale + 0.33) + 0.45)
-    grid = figure.add_gridspec(rows, 2 * columns, width_ratios=[across, along] * columns)
+    gap = 0.12 * across  # between one state and the next
+    widths = [across, along, gap] * columns
+    grid = figure.add_gridspec(rows, len(widths) - 1, width_ratios=widths[:-1])
     outline = jaw_outline(result.scene.clamp.jaw, 2.0 * up)
     open_height = result.closing[0].values["outer_radius_mm"]
     for place, (letter, index) in enumerate(states.items()):
@@ -39,8 +41,8 @@ def plot_sections(result: Clamped) -> Picture:
         row, column = divmod(place, COLUMNS)
         x = np.asarray(kept.state.x)
         height = jaw_height_shown(model, kept.state, open_height)
-        left = figure.add_subplot(grid[row, 2 * column])
-        right = figure.add_subplot(grid[row, 2 * column + 1])
+        left = figure.add_subplot(grid[row, 3 * column])
+        right = figure.add_subplot(grid[row, 3 * column + 1])
         for side in (1, -1):
             _bar(left, side * height, side * 2.0 * up, across)
             right.add_patch(
@@ -59,7 +61,7 @@ def plot_sections(result: Clamped) -> Picture:
         left.set_title(letter, fontsize=LARGE, color=INK, loc="left", fontweight="bold")
         said = f"travel {record['jaw_travel_mm']:.2f} mm, occlusion {record['occlusion']:.1%}"
         right.set_title(said if place else "in the body", fontsize=SMALL, color=INK, loc="right")
-    _key(figure, result, figure.axes[0], figure.axes[1], up, along)
+    _key(figure, result, figure.axes[1], up, along)
     return figure
 
 
@@ -102,11 +104,9 @@ def _ring(quarter: np.ndarray) -> np.ndarray:
 
 def _longitudinal_section(axes: Axes, result: Clamped, x: np.ndarray, layer: int) -> None:
     points = _plane_of_layer(result, x, layer)[:, -1][..., [2, 1]]
-    right = np.concatenate([points[:, 0], points[::-1, -1]])
     fill, edge = layer_colour(layer)
     inner, outer = points[:, 0], points[:, -1]
     band = np.concatenate([inner[::-1] * [-1, 1], inner[1:], outer[::-1], outer[1:] * [-1, 1]])
-    assert len(band) == 2 * len(right) - 2
     for side in (1, -1):
         axes.add_patch(Polygon(band * [1, side], facecolor=fill, edgecolor=edge, linewidth=0.8))
     _element_lines(axes, points, edge)
@@ -129,7 +129,7 @@ def _frame(axes: Axes, half_width: float, half_height: float) -> None:
         spine.set_visible(False)
 
 
-def _key(figure: Picture, result: Clamped, cross: Axes, along: Axes, up: float, half_width: float) -> None:
+def _key(figure: Picture, result: Clamped, along: Axes, up: float, half_width: float) -> None:
     """Names of layers and jaws, and a scale."""
     names = [layer.name for layer in result.scene.artery.layers]
     handles = [

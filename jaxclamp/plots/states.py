@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 from jaxclamp.assembly import State
@@ -35,7 +36,7 @@ class Clamped(Protocol):
     @property
     def physiological(self) -> KeptState | None: ...
     @property
-    def closing(self) -> list[Any]: ...
+    def closing(self) -> Sequence[KeptState]: ...
     @property
     def history(self) -> list[dict[str, Any]]: ...
     @property
@@ -54,4 +55,4 @@ def final_state(result: Clamped) -> KeptState:
     """The last converged state from the physiological one on."""
     if not result.closing:
         raise ValueError("the artery in the body did not converge: there is no clamped state to draw")
-    return result.closing[-1]  # type: ignore[no-any-return]
+    return result.closing[-1]

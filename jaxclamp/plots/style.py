@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -55,9 +56,17 @@ def dress(axes: Axes, x: str = "", y: str = "", title: str = "", grid: bool = Tr
         axes.set_axisbelow(True)
 
 
-def legend(axes: Axes, **options: object) -> None:
-    """A legend without a frame."""
-    axes.legend(fontsize=SMALL, frameon=False, labelcolor=INK, handlelength=2.2, **options)
+def legend(axes: Axes, **options: Any) -> None:
+    """A legend on a white patch without a border."""
+    axes.legend(
+        fontsize=SMALL,
+        facecolor="white",
+        edgecolor="none",
+        framealpha=0.9,
+        labelcolor=INK,
+        handlelength=2.2,
+        **options,
+    )
 
 
 def layer_colour(number: int) -> tuple[str, str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
 from matplotlib.axes import Axes
 
 from jaxclamp.fields import LayerFields, layer_fields
@@ -68,7 +67,7 @@ def _through_wall(axes: Axes, layers: tuple[LayerFields, ...]) -> None:
             )
         axes.text(
             0.5 * (radius[0] + radius[-1]),
-            1.0,
+            0.985,
             layer.name,
             transform=axes.get_xaxis_transform(),
             ha="center",
@@ -79,8 +78,8 @@ def _through_wall(axes: Axes, layers: tuple[LayerFields, ...]) -> None:
     axes.axhline(0.0, color=FAINT, linewidth=0.8)
     for boundary in ends[1:-1:2]:
         axes.axvline(boundary, color=INK, linewidth=0.8)
-    axes.set_xlim(ends[0], ends[-1])
+    margin = 0.02 * (ends[-1] - ends[0])
+    axes.set_xlim(ends[0] - margin, ends[-1] + margin)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.08 * (high - low))
     axes.locator_params(axis="x", nbins=6)
-    assert np.all(np.diff(ends) >= 0.0)

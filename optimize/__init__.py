@@ -1,0 +1,1 @@
+"""Jaw design by gradients of the engine. Nothing is here before it works."""
