@@ -10,7 +10,9 @@ all pairs of nodes.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -27,10 +29,9 @@ from jaxclamp.energies import (
     dilatation_density,
     jaw_gap,
     lumen_density,
-    material_groups,
-    over_cells,
     wall_density,
 )
+from jaxclamp.materials import Material
 from jaxclamp.meshes import Mesh
 from jaxclamp.pytree import record, static
 from jaxclamp.tensors import Tensor, det, pointwise_derivatives, total
@@ -89,11 +90,14 @@ class Topology:
     lumen_facets: np.ndarray
     outer_facets: np.ndarray
     slots: tuple[np.ndarray, ...]
-    """where each entry of the matrices of cells, lumen and outer facets goes in the sparse values;
-    the place behind the last one takes what belongs nowhere"""
+    """where the matrix entries of each block of cells, of the lumen and of the outer facets go in
+    the sparse values; the place behind the last one takes what belongs nowhere"""
     free: np.ndarray
     """degree of freedom 3 node + component of each unknown, (n_free,)"""
     layer_cells: tuple[tuple[int, int], ...] = static()
+    """first and last-plus-one cell of each layer"""
+    blocks: tuple[tuple[int, int, int], ...] = static()
+    """layer, first and last-plus-one cell of each block"""
     n_nonzeros: int = static()
 
 
@@ -119,6 +123,27 @@ def supported(mesh: Mesh) -> np.ndarray:
     return held
 
 
+POINTS_PER_BLOCK = 2400
+"""quadrature points differentiated together: their intermediate arrays then fit a core's cache"""
+
+
+def cut_into_blocks(
+    layer_cells: tuple[tuple[int, int], ...], points_per_cell: int
+) -> tuple[tuple[int, int, int], ...]:
+    """Blocks (layer, first cell, last + 1) of one size, a common divisor of the layers' counts.
+
+    One size means one compiled program; a block within a layer has one material.
+    """
+    common = math.gcd(*[last - first for first, last in layer_cells])
+    wanted = max(POINTS_PER_BLOCK // points_per_cell, 1)
+    size = max(d for d in range(1, min(wanted, common) + 1) if common % d == 0)
+    return tuple(
+        (layer, start, start + size)
+        for layer, (first, last) in enumerate(layer_cells)
+        for start in range(first, last, size)
+    )
+
+
 def build_topology(mesh: Mesh) -> tuple[Topology, Pattern]:
     """Number the unknowns and find the place of every cell-matrix entry in the sparse tangent."""
     free = np.flatnonzero(~supported(mesh).ravel())
@@ -136,13 +161,15 @@ def build_topology(mesh: Mesh) -> tuple[Topology, Pattern]:
         key[(rows < 0) | (columns < 0) | mirror[..., None]] = -1
         return key.ravel()
 
-    wall, lumen, outer = (keys(nodes) for nodes in (mesh.cells, mesh.lumen_facets, mesh.outer_facets))
-    stacked = np.concatenate([wall, lumen, outer])
+    blocks = cut_into_blocks(mesh.layer_cells, len(mesh.element.quadrature()[1]))
+    parts = [mesh.cells[:, first:last] for _, first, last in blocks] + [mesh.lumen_facets, mesh.outer_facets]
+    entries = [keys(nodes) for nodes in parts]
+    stacked = np.concatenate(entries)
     distinct, place = np.unique(stacked, return_inverse=True)
     skipped = int(distinct[0] == -1)
     n_nonzeros = len(distinct) - skipped
     slots = np.where(stacked < 0, n_nonzeros, place - skipped).astype(np.int32)
-    ends = np.cumsum([wall.size, lumen.size])
+    ends = np.cumsum([part.size for part in entries[:-1]])
     rows, indices = np.divmod(distinct[skipped:], n)
     indptr = np.searchsorted(rows, np.arange(n + 1))
     topology = Topology(
@@ -152,6 +179,7 @@ def build_topology(mesh: Mesh) -> tuple[Topology, Pattern]:
         slots=tuple(np.split(slots, ends)),
         free=free.astype(np.int32),
         layer_cells=mesh.layer_cells,
+        blocks=blocks,
         n_nonzeros=n_nonzeros,
     )
     return topology, Pattern(indptr.astype(np.int32), indices.astype(np.int32))
@@ -213,26 +241,6 @@ def _scatter(nodes: AnyArray, values: Array, n_nodes: int) -> Array:
     return jnp.zeros((n_nodes, 3)).at[nodes].add(jnp.swapaxes(values, 1, 2))
 
 
-def _wall_densities(body: Body, p: Array) -> list[tuple[int, int, Density]]:
-    """Wall density of each run of layers with one law: (first cell, last + 1, density)."""
-    g, materials = body.geometry, body.parameters.materials
-    at_point = jnp.einsum("mq,mc->qc", body.stencils.modes, p)
-    ranges = body.topology.layer_cells
-    runs: list[tuple[int, int, Density]] = []
-    for first, last in material_groups(materials):
-        start, stop = ranges[first][0], ranges[last - 1][1]
-        counts = tuple(b - a for a, b in ranges[first:last])
-        density = partial(
-            wall_density,
-            to_local=g.to_local[..., start:stop],
-            dV=g.dV[..., start:stop],
-            material=over_cells(materials[first:last], counts),
-            p=at_point[:, start:stop],
-        )
-        runs.append((start, stop, density))
-    return runs
-
-
 def _lumen(body: Body, pressure: Array) -> Density:
     n = round(body.stencils.lumen.shape[0] ** 0.5)
     weights = jnp.asarray(tensor_rule((n, n))[1])[:, None]
@@ -244,26 +252,35 @@ def _jaw(body: Body, jaw_height: Array) -> Density:
     return lambda y: contact_density(y, jaw_height, par.jaw, par.contact, body.geometry.dA)
 
 
-def _dilatation(body: Body, dx_dxi: Array) -> Array:
+def _dilatation(stencils: Stencils, geometry: Geometry, dx_dxi: Array) -> Array:
     """int N_m (J - 1) dV of every cell, mm^3, (n_m, n_cells)."""
-    density = dilatation_density(dx_dxi, body.geometry.to_local, body.geometry.dV)
-    return jnp.einsum("mq,qc->mc", body.stencils.modes, density)
+    density = dilatation_density(dx_dxi, geometry.to_local, geometry.dV)
+    return jnp.einsum("mq,qc->mc", stencils.modes, density)
 
 
-def _condensed_pressure(body: Body, dilatation: Array) -> Array:
+def _condensed_pressure(geometry: Geometry, dilatation: Array) -> Array:
     """The pressure in equilibrium with a dilatation: M^-1 int N_m (J - 1) dV, (n_m, n_cells)."""
-    return jnp.einsum("mnc,nc->mc", body.geometry.pressure_stiffness, dilatation)
+    return jnp.einsum("mnc,nc->mc", geometry.pressure_stiffness, dilatation)
 
 
 def potential(body: Body, x: Array, jaw_height: Array, pressure: Array) -> Array:
     """Pi with the pressures at their best, uJ: a function of positions and loads alone."""
     x_cells = _gather(x, body.topology.cells)
     dx_dxi = at_points(body.stencils.wall, x_cells)
-    dilatation = _dilatation(body, dx_dxi)
-    volumetric = 0.5 * jnp.sum(dilatation * _condensed_pressure(body, dilatation))
-    zero = jnp.zeros_like(dilatation)
+    dilatation = _dilatation(body.stencils, body.geometry, dx_dxi)
+    volumetric = 0.5 * jnp.sum(dilatation * _condensed_pressure(body.geometry, dilatation))
+    zero = jnp.zeros(())
     wall = total(
-        jnp.sum(density(dx_dxi[..., start:stop])) for start, stop, density in _wall_densities(body, zero)
+        jnp.sum(
+            wall_density(
+                dx_dxi[..., first:last],
+                body.geometry.to_local[..., first:last],
+                body.geometry.dV[:, first:last],
+                material,
+                zero,
+            )
+        )
+        for material, (first, last) in zip(body.parameters.materials, body.topology.layer_cells, strict=True)
     )
     lumen = jnp.sum(
         _lumen(body, pressure)(at_points(body.stencils.lumen, _gather(x, body.topology.lumen_facets)))
@@ -277,81 +294,134 @@ def contact_potential(body: Body, x: Array, jaw_height: Array) -> Array:
     return jnp.sum(_jaw(body, jaw_height)(y))
 
 
+@record
+class Block:
+    """Some cells of one layer, linearised."""
+
+    energy: Array
+    """wall energy with the pressures at their best, uJ"""
+    force: Array
+    """d Pi/dx of the cells' nodes, pressures condensed, mN, (n_en, 3, n_cells)"""
+    matrix: Array
+    """condensed tangent, mN/mm, (n_en, n_en, 6, n_cells)"""
+    volume_error: Array
+    J_min: Array
+    J_max: Array
+
+
+@record
+class Piece:
+    """The cells of one block, cut out of body and state."""
+
+    x: Array
+    """current position of the nodes, mm, (n_en, 3, n_cells)"""
+    p: Array
+    """pressure modes, kPa, (n_m, n_cells)"""
+    geometry: Geometry
+
+
 @jax.jit
-def linearise(body: Body, state: State, pressure: Array) -> Linearisation:
-    """Forces and condensed tangent at a state.
+def cut(body: Body, state: State) -> list[Piece]:
+    """Body and state cut into blocks.
+
+    A program of its own: slices inside the program that differentiates would keep it from being vectorised.
+    """
+    g = replace(body.geometry, dA=jnp.zeros((0, body.geometry.dV.shape[-1])))
+    return [
+        Piece(
+            x=_gather(state.x, body.topology.cells[:, first:last]),
+            p=state.p[:, first:last],
+            geometry=jax.tree_util.tree_map(lambda a, i=first, j=last: a[..., i:j], g),
+        )
+        for _, first, last in body.topology.blocks
+    ]
+
+
+@jax.jit
+def linearise_block(piece: Piece, stencils: Stencils, material: Material) -> Block:
+    """Energy, forces and condensed tangent of the cells of a block.
 
     The tangent uses the *stored* pressures in its geometric part and eliminates their increments
     cell by cell: K = K_xx(p) + G M^-1 G', residual = d Psi/dx + G M^-1 int N (J - 1). With p
     updated along the step (`advance`) this is Newton's method on (x, p).
     """
-    top, st, g = body.topology, body.stencils, body.geometry
-    x, n_nodes = state.x, state.x.shape[0]
-    x_cells = _gather(x, top.cells)
-    dx_dxi = at_points(st.wall, x_cells)
-
-    energies, forces, matrices = [], [], []
-    for start, stop, density in _wall_densities(body, state.p):
-        e, f, k = cell_derivatives(density, st.wall, x_cells[..., start:stop])
-        energies.append(jnp.sum(e))
-        forces.append(f)
-        matrices.append(k)
-    wall_force, wall_matrix = jnp.concatenate(forces, axis=-1), jnp.concatenate(matrices, axis=-1)
+    x, p, g = piece.x, piece.p, piece.geometry
+    at_point = jnp.einsum("mq,mc->qc", stencils.modes, p)
+    density = partial(wall_density, to_local=g.to_local, dV=g.dV, material=material, p=at_point)
+    energies, force, matrix = cell_derivatives(density, stencils.wall, x)
 
     # pressures: force of each mode, and what is missing to p = M^-1 int N (J - 1)
-    dilatation = _dilatation(body, dx_dxi)
-    missing = _condensed_pressure(body, dilatation) - state.p
+    dx_dxi = at_points(stencils.wall, x)
+    dilatation = _dilatation(stencils, g, dx_dxi)
+    missing = _condensed_pressure(g, dilatation) - p
     slope = jax.grad(lambda y: jnp.sum(dilatation_density(y, g.to_local, g.dV)))(dx_dxi)
-    modes = [to_nodes(st.wall, slope * mode[:, None]) for mode in st.modes]
+    modes = [to_nodes(stencils.wall, slope * mode[:, None]) for mode in stencils.modes]
     stiff_modes = [
-        total([g.pressure_stiffness[m, n] * mode for n, mode in enumerate(modes)]) for m in range(len(modes))
+        total(g.pressure_stiffness[m, n] * mode for n, mode in enumerate(modes)) for m in range(len(modes))
     ]
-    wall_force = wall_force + total([mode * missing[m] for m, mode in enumerate(modes)])
-    wall_matrix = wall_matrix + total(
+    force = force + total(mode * missing[m] for m, mode in enumerate(modes))
+    matrix = matrix + total(
         jnp.stack([a[:, None, i] * b[None, :, j] for i, j in PAIRS], axis=2)
         for a, b in zip(modes, stiff_modes, strict=True)
     )
     # potential with p eliminated: replace int p (J - 1) by 1/2 D' M^-1 D
-    volumetric = 0.5 * jnp.sum(dilatation * (missing + state.p)) - jnp.sum(state.p * dilatation)
+    volumetric = 0.5 * jnp.sum(dilatation * (missing + p)) - jnp.sum(p * dilatation)
+    J = det(dx_dxi) * det(g.to_local)
+    compliance = 1.0 / (g.pressure_stiffness[0, 0] * jnp.sum(g.dV, axis=0))
+    return Block(
+        energy=jnp.sum(energies) + volumetric,
+        force=force,
+        matrix=matrix,
+        volume_error=jnp.max(jnp.abs(jnp.einsum("mq,mc->qc", stencils.modes, missing)) * compliance),
+        J_min=jnp.min(J),
+        J_max=jnp.max(J),
+    )
 
+
+@jax.jit
+def assemble(body: Body, state: State, pressure: Array, blocks: list[Block]) -> Linearisation:
+    """Blood pressure, contact, and the blocks of the wall, summed into residual and tangent."""
+    top, st = body.topology, body.stencils
+    x, n_nodes = state.x, state.x.shape[0]
     lumen_e, lumen_f, lumen_k = cell_derivatives(
         _lumen(body, pressure), st.lumen, _gather(x, top.lumen_facets)
     )
     jaw_e, jaw_f, jaw_k = cell_derivatives(
         _jaw(body, state.jaw_height), st.contact, _gather(x, top.outer_facets)
     )
+    # one scatter per block: XLA's is many times slower on a concatenation
     values = jnp.zeros(top.n_nonzeros + 1)
-    for slots, matrix in zip(top.slots, (wall_matrix, lumen_k, jaw_k), strict=True):
+    for slots, matrix in zip(top.slots, [*[b.matrix for b in blocks], lumen_k, jaw_k], strict=True):
         values = values.at[slots].add(matrix.ravel(), mode="promise_in_bounds")
-    force = (
-        _scatter(top.cells, wall_force, n_nodes)
-        + _scatter(top.lumen_facets, lumen_f, n_nodes)
-        + _scatter(top.outer_facets, jaw_f, n_nodes)
-    ).ravel()
+    force = _scatter(top.lumen_facets, lumen_f, n_nodes) + _scatter(top.outer_facets, jaw_f, n_nodes)
+    for (_, first, last), block in zip(top.blocks, blocks, strict=True):
+        force = force + _scatter(top.cells[:, first:last], block.force, n_nodes)
+    force = force.ravel()
 
     slope_of_height = lambda d: jax.grad(contact_potential, argnums=(1, 2))(body, x, d)  # noqa: E731
     (_, along_height), (coupling, stiffness) = jax.jvp(
         slope_of_height, (state.jaw_height,), (jnp.ones_like(state.jaw_height),)
     )
-    J = det(dx_dxi) * det(g.to_local)
     return Linearisation(
-        energy=total(energies) + volumetric + jnp.sum(lumen_e) + jnp.sum(jaw_e),
+        energy=total(b.energy for b in blocks) + jnp.sum(lumen_e) + jnp.sum(jaw_e),
         residual=force[top.free],
         reactions=jnp.linalg.norm(force.at[top.free].set(0.0)),
-        volume_error=jnp.max(jnp.abs(jnp.einsum("mq,mc->qc", st.modes, missing)) * _compliance(body)),
+        volume_error=jnp.max(jnp.stack([b.volume_error for b in blocks])),
         values=values[:-1],
         jaw_force=-along_height,
         jaw_coupling=coupling.ravel()[top.free],
         jaw_stiffness=stiffness,
-        J_min=jnp.min(J),
-        J_max=jnp.max(J),
+        J_min=jnp.min(jnp.stack([b.J_min for b in blocks])),
+        J_max=jnp.max(jnp.stack([b.J_max for b in blocks])),
     )
 
 
-def _compliance(body: Body) -> Array:
-    """1/bulk of every cell, (n_cells,)."""
-    volume = jnp.sum(body.geometry.dV, axis=0)
-    return 1.0 / (body.geometry.pressure_stiffness[0, 0] * volume)
+def linearise(body: Body, state: State, pressure: Array | float) -> Linearisation:
+    """Forces and condensed tangent at a state, block by block."""
+    materials = [body.parameters.materials[layer] for layer, _, _ in body.topology.blocks]
+    pieces = cut(body, state)
+    blocks = [linearise_block(p, body.stencils, m) for p, m in zip(pieces, materials, strict=True)]
+    return assemble(body, state, pressure, blocks)
 
 
 @jax.jit
@@ -359,10 +429,10 @@ def advance(body: Body, state: State, dx: Array, d_height: Array, fraction: Arra
     """Go a fraction of the Newton step: free unknowns dx (n_free,), jaw, and condensed pressures."""
     step = jnp.zeros(state.x.size).at[body.topology.free].set(dx).reshape(state.x.shape)
     dilate = lambda x: _dilatation(  # noqa: E731
-        body, at_points(body.stencils.wall, _gather(x, body.topology.cells))
+        body.stencils, body.geometry, at_points(body.stencils.wall, _gather(x, body.topology.cells))
     )
     dilatation, change = jax.jvp(dilate, (state.x,), (step,))
-    dp = _condensed_pressure(body, dilatation + change) - state.p
+    dp = _condensed_pressure(body.geometry, dilatation + change) - state.p
     return State(
         x=state.x + fraction * step,
         p=state.p + fraction * dp,
@@ -374,7 +444,8 @@ def advance(body: Body, state: State, dx: Array, d_height: Array, fraction: Arra
 def with_equilibrium_pressure(body: Body, x: Array, jaw_height: Array) -> State:
     """A state whose pressures fit its dilatation: p = M^-1 int N (J - 1) dV."""
     y = at_points(body.stencils.wall, _gather(x, body.topology.cells))
-    return State(x=x, p=_condensed_pressure(body, _dilatation(body, y)), jaw_height=jaw_height)
+    p = _condensed_pressure(body.geometry, _dilatation(body.stencils, body.geometry, y))
+    return State(x=x, p=p, jaw_height=jaw_height)
 
 
 def gaps(body: Body, state: State) -> Array:

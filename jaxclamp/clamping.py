@@ -272,9 +272,7 @@ class _Walk:
             try:
                 return descend(self.system, start, step)
             except NotConverged as error:
-                raise EquilibriumError(
-                    stage, load, error.residual, error.J_min, f"{error}; {_ADVICE[stage]}"
-                ) from error
+                raise EquilibriumError(stage, f"at {load}", error, _ADVICE[stage]) from error
 
     def error(self, stage: str, last: Equilibrium, failure: NotConverged) -> EquilibriumError:
         """The sentence for a user, with the last load that did converge."""
@@ -283,15 +281,13 @@ class _Walk:
             load = f"occlusion {occlusion:.1%}, jaw height {float(last.state.jaw_height):.4f} mm"
         else:
             load = f"pressure {last.pressure:.4g} kPa, axial stretch {last.axial_stretch:.4g}"
-        return EquilibriumError(
-            stage, "the step after " + load, failure.residual, failure.J_min, f"{failure}; {_ADVICE[stage]}"
-        )
+        return EquilibriumError(stage, f"beyond {load}", failure, _ADVICE[stage])
 
 
 _ADVICE = {
     "load-free": "check radii, thicknesses and opening angles of the layers",
     "physiological": "check pressure and axial stretch against the stiffness of the wall, or refine the mesh",
-    "clamping": "round the jaw's edges, refine the mesh under them, or stop earlier",
+    "clamping": "stop earlier, round the jaw's edges, or refine the mesh under them",
 }
 
 

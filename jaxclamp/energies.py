@@ -14,8 +14,6 @@ Everything is written over points with the batch axes (n_q points per cell, n_ce
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +24,7 @@ from jaxclamp.elements import lagrange, tensor_rule
 from jaxclamp.jaws import Jaw
 from jaxclamp.materials import Material
 from jaxclamp.meshes import Mesh, stress_free_positions
-from jaxclamp.pytree import record, shape_of
+from jaxclamp.pytree import record
 from jaxclamp.scene import Artery, MeshSettings
 from jaxclamp.tensors import Tensor, Vector, cross, det, inverse, norm, product, stacked, transpose
 
@@ -123,27 +121,6 @@ def _cylindrical_axes(X: Array) -> Array:
     cosine, sine = X[0] / length, X[1] / length
     rows = [(cosine, sine, zero), (-sine, cosine, zero), (zero, zero, zero + 1.0)]
     return jnp.stack([jnp.stack(row) for row in rows])
-
-
-def material_groups(materials: tuple[Material, ...]) -> tuple[tuple[int, int], ...]:
-    """Runs of consecutive layers with one law (first, last + 1): each run is one compiled kernel."""
-    groups: list[tuple[int, int]] = []
-    for i, material in enumerate(materials):
-        if groups and shape_of(materials[groups[-1][0]])[0] == shape_of(material)[0]:
-            groups[-1] = (groups[-1][0], i + 1)
-        else:
-            groups.append((i, i + 1))
-    return tuple(groups)
-
-
-def over_cells(materials: tuple[Material, ...], counts: tuple[int, ...]) -> Any:
-    """One material whose constants are arrays over the cells of several layers, (n_cells,)."""
-    return jax.tree_util.tree_map(
-        lambda *leaves: jnp.concatenate(
-            [jnp.broadcast_to(leaf, (n,)) for leaf, n in zip(leaves, counts, strict=True)]
-        ),
-        *materials,
-    )
 
 
 def wall_density(dx_dxi: Tensor, to_local: Tensor, dV: Array, material: Material, p: Array) -> Array:

@@ -27,6 +27,8 @@ MAX_CUTS = 2
 DIVERGING = 4.0
 MAX_DESCENT = 150
 MAX_SHIFTS = 30
+MAX_LINEARISATIONS = 3000
+"""a clamping that needs more is given up, so that nothing runs for ever"""
 SUFFICIENT_FALL = 1e-4
 GOOD_MODEL = 0.3
 EASY_ITERATIONS = 5
@@ -42,13 +44,14 @@ VOLUME_TOLERANCE = 1e-8
 class EquilibriumError(Exception):
     """No converged equilibrium. One sentence; `result` keeps the states that did converge."""
 
-    def __init__(self, stage: str, load: str, residual: float, J_min: float, advice: str) -> None:
-        self.stage, self.load, self.residual, self.J_min, self.advice = stage, load, residual, J_min, advice
+    def __init__(self, stage: str, load: str, failure: NotConverged, advice: str) -> None:
+        self.stage, self.load, self.advice = stage, load, advice
+        self.residual, self.J_min = failure.residual, failure.J_min
         self.result: object | None = None
-        super().__init__(
-            f"no equilibrium was found in stage '{stage}' at {load} "
-            f"(residual {residual:.2g} mN, smallest J {J_min:.3g}): {advice}"
-        )
+        numbers = ""
+        if math.isfinite(self.residual):
+            numbers = f" (residual {self.residual:.2g} mN, smallest J {self.J_min:.3g})"
+        super().__init__(f"no equilibrium in stage '{stage}', {load}: {failure}{numbers}; {advice}")
 
 
 class NotConverged(Exception):
@@ -167,7 +170,9 @@ class System:
     linearisations: int = 0
 
     def linearise(self, state: State, pressure: float) -> Linearisation:
-        """Forces and tangent, on the host (numpy arrays)."""
+        """Forces and tangent, on the host (numpy arrays). Raises NotConverged when patience is out."""
+        if self.linearisations >= MAX_LINEARISATIONS:
+            raise NotConverged(f"given up after {MAX_LINEARISATIONS} assemblies")
         start = time.perf_counter()
         lin: Linearisation = jax.device_get(linearise(self.body, state, jnp.asarray(pressure)))
         seconds = time.perf_counter() - start

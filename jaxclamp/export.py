@@ -94,9 +94,10 @@ def _into_place(staging: Path, folder: Path, written: list[Path]) -> list[Path]:
         parent.mkdir(exist_ok=True)
     for name in names:
         os.replace(staging / name, folder / name)
-    for old in [*folder.glob(f"{STATES}/*_[0-9][0-9][0-9].vtu"), *folder.glob(f"{FIGURES}/*.png")]:
-        if old.relative_to(folder) not in names:
-            old.unlink()
+    for pattern in (f"{STATES}/artery_*.vtu", f"{STATES}/jaws_*.vtu", f"{FIGURES}/*.png"):
+        for old in folder.glob(pattern):
+            if old.relative_to(folder) not in names:
+                old.unlink()
     return [folder / name for name in names]
 
 

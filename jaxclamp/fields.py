@@ -102,10 +102,13 @@ def _averaged(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     return total / np.bincount(cells.ravel(), minlength=n)
 
 
+_contact_pressure = jax.jit(contact_pressure, static_argnums=2)
+
+
 def nodal_contact_pressure(model: Model, state: State) -> np.ndarray:
     """Contact pressure spread to the nodes of the outer wall by area, kPa, 0 elsewhere, (n_nodes,)."""
     mesh, stencil = model.mesh, np.asarray(model.body.stencils.contact)[:, 0]
-    pressure, area = (np.asarray(v) for v in contact_pressure(model.body, state, mesh.element))
+    pressure, area = (np.asarray(v) for v in _contact_pressure(model.body, state, mesh.element))
     share = np.abs(stencil).T
     force = np.bincount(mesh.outer_facets.ravel(), (share @ (pressure * area)).ravel(), mesh.n_nodes)
     around = np.bincount(mesh.outer_facets.ravel(), (share @ area).ravel(), mesh.n_nodes)
@@ -151,8 +154,8 @@ def _turned(element: Element) -> np.ndarray:
 def spread(positions: Sequence[float], count: int) -> list[int]:
     """Up to `count` increasing places of `positions`, the first and the last among them, evenly spread."""
     values = np.asarray(positions, dtype=float)
-    wanted = np.linspace(values[0], values[-1], min(count, len(values)))
-    return sorted({int(np.argmin(np.abs(values - w))) for w in wanted} | {0, len(values) - 1})
+    between = np.linspace(values[0], values[-1], min(count, len(values)))[1:-1]
+    return sorted({int(np.argmin(np.abs(values - w))) for w in between} | {0, len(values) - 1})
 
 
 # --------------------------------------------------------------------------------- the jaw as drawn

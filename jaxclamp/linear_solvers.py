@@ -37,52 +37,34 @@ class BackEnd(Protocol):
 
 
 class _Pardiso:
-    """MKL PARDISO (py-mkl-pardiso): Cholesky while the tangent is definite, else L D L'.
-
-    Cholesky takes 60 % of the time of L D L' and fails at once on an indefinite matrix. After a
-    failure the next few matrices go to L D L' directly.
-    """
+    """MKL PARDISO, L D L' with Bunch-Kaufman pivots (py-mkl-pardiso)."""
 
     def __init__(self, pattern: Pattern) -> None:
         self._pattern = pattern
-        self._solvers: dict[int, Any] = {}
-        self._indefinite_for = 0
+        self._solver: Any = None
 
     def factor(self, values: np.ndarray) -> int | None:
         import pymklpardiso
 
         if not np.all(np.isfinite(values)):
             raise Singular("the tangent is not finite")
-        if self._indefinite_for == 0:
-            try:
-                self._current = self._factored(pymklpardiso.MTYPE_REAL_SYM_POSDEF, values)
-                return 0
-            except RuntimeError:
-                self._indefinite_for = 3
-        self._indefinite_for -= 1
         try:
-            self._current = self._factored(pymklpardiso.MTYPE_REAL_SYM_INDEF, values)
+            if self._solver is None:
+                n = self._pattern.n
+                matrix = sp.csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(n, n))
+                self._solver = pymklpardiso.PardisoSolver(
+                    matrix, pymklpardiso.MTYPE_REAL_SYM_INDEF, iparms=_PARDISO_SETTINGS
+                )
+            else:
+                self._solver.refactor(values)
         except RuntimeError as error:
             raise Singular(str(error)) from error
-        if self._current.get_iparm_value(13) > 0:
+        if self._solver.get_iparm_value(13) > 0:
             raise Singular("the tangent is singular to working precision")
-        return int(self._current.get_iparm_value(22))
-
-    def _factored(self, kind: int, values: np.ndarray) -> Any:
-        import pymklpardiso
-
-        solver = self._solvers.get(kind)
-        if solver is None:
-            n = self._pattern.n
-            matrix = sp.csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(n, n))
-            solver = pymklpardiso.PardisoSolver(matrix, kind, iparms=_PARDISO_SETTINGS)
-            self._solvers[kind] = solver
-        else:
-            solver.refactor(values)
-        return solver
+        return int(self._solver.get_iparm_value(22))
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        return np.asarray(self._current.solve(b))
+        return np.asarray(self._solver.solve(b))
 
 
 # indices and meanings: oneMKL reference, pardiso iparm. No default start (0), METIS (1), no

@@ -19,7 +19,6 @@ from jax import Array
 
 from jaxclamp.assembly import Body, State, at_points, contact_potential, gaps, potential
 from jaxclamp.elements import Element, gauss, lagrange, tensor_rule
-from jaxclamp.energies import material_groups, over_cells
 from jaxclamp.meshes import Mesh
 from jaxclamp.pytree import record, static
 from jaxclamp.tensors import cross, det, norm, product, smooth_maximum, stacked, total, transpose
@@ -93,11 +92,8 @@ def cauchy_stress(body: Body, state: State) -> tuple[dict[tuple[int, int], Array
     sigma = p I + (1/J) d psi_bar/dF F', with the pressure of the cell.
     """
     F = deformation(body, state.x)
-    ranges, materials = body.topology.layer_cells, body.parameters.materials
     parts = []
-    for first, last in material_groups(materials):
-        start, stop = ranges[first][0], ranges[last - 1][1]
-        material = over_cells(materials[first:last], tuple(b - a for a, b in ranges[first:last]))
+    for material, (start, stop) in zip(body.parameters.materials, body.topology.layer_cells, strict=True):
         local = {key: value[:, start:stop] for key, value in F.items()}
         P = jax.grad(lambda G, m=material: jnp.sum(m.psi_bar(G)))(local)
         parts.append(stacked(product(P, transpose(local))) / det(local))

@@ -9,6 +9,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxclamp.fields import layer_fields
+
 if TYPE_CHECKING:
     from jaxclamp.plots import Plate
     from jaxclamp.results import Result
@@ -69,7 +71,7 @@ th, td { text-align: left; padding: .3rem .8rem .3rem 0; border-bottom: 1px soli
 th { font-weight: 600; color: var(--faint); }
 td.number, th.number { text-align: right; white-space: nowrap; padding-right: 1.4rem; }
 .scroll + .scroll { margin-top: 1.4rem; }
-.good { color: var(--good); font-weight: 600; } .look { color: var(--look); font-weight: 600; }
+.good, .look { color: var(--good); font-weight: 600; white-space: nowrap; } .look { color: var(--look); }
 figure { margin: 1.4rem 0; break-inside: avoid; }
 figure img { display: block; margin: 0 auto; max-width: 100%; height: auto; background: #fff;
   border: 1px solid var(--rule); border-radius: 6px; padding: .6rem; }
@@ -77,8 +79,9 @@ figcaption { color: var(--faint); margin-top: .5rem; }
 figcaption b { color: var(--ink); }
 pre { background: var(--card); border-radius: 6px; padding: 1rem; white-space: pre-wrap;
   overflow-wrap: anywhere; font-size: .82rem; line-height: 1.45; }
-@media print { body { max-width: none; padding: 0; font-size: 10pt; } h2 { break-after: avoid; }
-  tr, pre { break-inside: avoid; } }
+@media print { body { max-width: none; padding: .5rem 0; font-size: 10pt; } h2 { break-after: avoid; }
+  tr { break-inside: avoid; } figure img { width: auto; max-height: 9.6cm; }
+  .headlines { grid-template-columns: repeat(4, 1fr); } }
 """
 
 
@@ -161,7 +164,7 @@ def _opening(title: str, content: dict[str, Any], result: Result) -> str:
         reason = content["failure"] or "the stop was not reached"
         lines.append(
             '<div class="notice"><b>The stop was not reached.</b> All numbers and figures are of the '
-            f"states that did converge. {escape(reason)}</div>"
+            f"states that did converge. {escape(reason[:1].upper() + reason[1:])}</div>"
         )
     boxes = [
         f"<div><b>{escape(number(final.get(key), key))}</b>{escape(label)}</div>"
@@ -218,31 +221,51 @@ def checks(result: Result) -> list[tuple[str, str, str, bool]]:
     """(what, value, what is expected, as expected) of the independent checks on the last state."""
     content = result.to_dict()
     final, solver = content["final"], content["solver"]
-    thickness = sum(float(layer.thickness) for layer in result.scene.artery.layers)
-    found: list[tuple[str, str, str, bool]] = []
+    wall = sum(float(layer.thickness) for layer in result.scene.artery.layers)
+    deepest, smallest, largest = 0.05 * wall, *_volume_ratios(result)
+    rows: list[tuple[str, str, Any, str, Callable[[Any], bool]]] = [
+        (
+            "jaw force against the symmetry plane, relative",
+            "",
+            solver["force_balance_error"],
+            "below 1e-6",
+            lambda v: v < 1e-6,
+        ),
+        ("forces left on free nodes", "_mN", solver["residual_mN"], "below 1e-4 mN", lambda v: v < 1e-4),
+        (
+            "work of the jaws against the change of energy, relative",
+            "",
+            solver["work_balance_error"],
+            "below 0.01",
+            lambda v: v < 0.01,
+        ),
+        (
+            "deepest point of the wall inside a jaw",
+            "_mm",
+            final.get("max_penetration_mm"),
+            f"below {deepest:.2g} mm, 5% of the wall",
+            lambda v: v < deepest,
+        ),
+        ("smallest volume ratio of a cell", "", smallest, "above 0.95", lambda v: v > 0.95),
+        ("largest volume ratio of a cell", "", largest, "below 1.05", lambda v: v < 1.05),
+        ("smallest volume ratio at a point", "", final.get("J_min"), "above 0.5", lambda v: v > 0.5),
+        ("largest volume ratio at a point", "", final.get("J_max"), "below 2", lambda v: v < 2.0),
+        ("negative pivots of the tangent", "", solver["negative_pivots"], "0: stable", lambda v: v == 0),
+        ("stability lost and regained on the way", "", solver["snapped"], "no", lambda v: not v),
+    ]
+    return [
+        (what, number(value, key), expected, bool(fine(value)))
+        for what, key, value, expected, fine in rows
+        if value is not None
+    ]
 
-    def add(what: str, value: Any, expected: str, fine: Callable[[Any], bool], key: str = "") -> None:
-        if value is not None:
-            found.append((what, number(value, key), expected, bool(fine(value))))
 
-    add("jaw force against the symmetry plane, relative", solver["force_balance_error"], "below 1e-6",
-        lambda v: v < 1e-6)  # fmt: skip
-    add("forces left on free nodes", solver["residual_mN"], "below 1e-4 mN", lambda v: v < 1e-4, "_mN")
-    add("work of the jaws against the change of energy, relative", solver["work_balance_error"],
-        "below 0.01", lambda v: v < 0.01)  # fmt: skip
-    limit = 0.05 * thickness
-    add("jaw inside the wall", final.get("max_penetration_mm"), f"below {limit:.2g} mm, 5 % of the wall",
-        lambda v: v < limit, "_mm")  # fmt: skip
-    add("smallest volume ratio at a quadrature point", final.get("J_min"), "above 0.5", lambda v: v > 0.5)
-    add("largest volume ratio at a quadrature point", final.get("J_max"), "below 2", lambda v: v < 2.0)
-    add(
-        "negative pivots of the tangent",
-        solver["negative_pivots"],
-        "0: the state is stable",
-        lambda v: v == 0,
-    )
-    add("a loss of stability was passed on the way", solver["snapped"], "no", lambda v: not v)
-    return found
+def _volume_ratios(result: Result) -> tuple[float | None, float | None]:
+    """Smallest and largest mean volume ratio of a cell in the last state."""
+    if not result.states:
+        return None, None
+    J = [layer.cell_data["J"] for layer in layer_fields(result.model, result.states[-1].state)]
+    return min(float(v.min()) for v in J), max(float(v.max()) for v in J)
 
 
 def _checks(found: list[tuple[str, str, str, bool]]) -> str:

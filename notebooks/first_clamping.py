@@ -13,7 +13,7 @@
 # %% [markdown]
 # # A first clamping
 #
-# A human coronary artery between two steel cylinders, closed until the lumen has lost 92.5 % of its
+# A human coronary artery between two rigid cylinders, closed until the lumen has lost 92.5 % of its
 # height: the study of Gasser, Schulze-Bauer and Holzapfel (J Biomech Eng 124, 2002), from
 # stress-free layers to the clamped artery in a few seconds.
 
@@ -87,7 +87,7 @@ result.plot_force_travel()
 # ## Another jaw
 #
 # The jaw is data: `replace` gives a scene with another radius. The first result serves as the
-# starting point, so that a neighbouring design costs a few Newton iterations instead of a whole
+# starting point, so that a neighbouring design costs a fraction of the Newton iterations of a whole
 # clamping.
 
 # %%

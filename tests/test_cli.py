@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from jaxclamp.cli import main
-from jaxclamp.equilibrium import EquilibriumError
+from jaxclamp.equilibrium import EquilibriumError, NotConverged
 from jaxclamp.presets import presets
 
 FIGURES = {
@@ -42,7 +42,7 @@ class FakeResult:
 
 
 def failed():
-    return EquilibriumError("clamping", "91 % occlusion", 1.0, 0.2, "refine the mesh")
+    return EquilibriumError("clamping", "beyond 91 % occlusion", NotConverged("cut", 1.0, 0.2), "refine the mesh")
 
 
 class Engine:

@@ -61,7 +61,7 @@ def plot_stress_at_P(result: Clamped) -> Picture:
     dress(axes, "travel of each jaw (mm)", "stress at P / stress at P in the body")
     _letter_states(axes, travel, marked)
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    legend(axes, loc="upper left")
+    legend(axes, loc="best")
     return figure
 
 

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from jaxclamp.fields import LayerFields, layer_fields, layer_nodes
 from jaxclamp.plots.states import Clamped, final_state
@@ -79,7 +80,7 @@ def _unrolled(
     value = np.take_along_axis(stress, highest, axis=2)[..., 0]
     z = np.take_along_axis(layer.on_grid(layer.points)[..., 2], highest, axis=2)[..., 0]
     angle = np.broadcast_to(angles, value.shape)
-    place = np.unravel_index(np.argmax(value), value.shape)
+    place = np.unravel_index(np.argmax(np.where(z <= zoom, value, -np.inf)), value.shape)
     peaks = [(side * z[place], a) for side in (1, -1) for a in (angle[place], 180.0 - angle[place])]
 
     value, z, angle = (np.concatenate([sign * v[:0:-1], v]) for v, sign in ((value, 1), (z, -1), (angle, 1)))
@@ -98,15 +99,29 @@ def _unrolled(
     axes.set_xlim(-zoom, zoom)
     axes.set_ylim(0.0, 180.0)
     axes.set_yticks([0, 45, 90, 135, 180], ["0, fold", "45", "90, jaw", "135", "180, fold"])
-    axes.plot(*np.transpose(peaks), "x", color="white", markersize=6, markeredgewidth=1.6)
+    axes.plot(
+        *np.transpose(peaks), "x", color="white", markersize=6, markeredgewidth=1.6, path_effects=_outlined()
+    )
     if mark_P:
         _P(axes, 0.0, 90.0)
+
+
+def _outlined() -> list[AbstractPathEffect]:
+    """White marks with a dark rim, seen on any colour."""
+    return [withStroke(linewidth=3.0, foreground=INK)]
 
 
 def _P(axes: Axes, x: float, y: float) -> None:
     axes.plot(x, y, "o", markersize=5, markerfacecolor="white", markeredgecolor=INK, markeredgewidth=1.0)
     axes.annotate(
-        "P", (x, y), (5, 5), textcoords="offset points", fontsize=NORMAL, color="white", weight="bold"
+        "P",
+        (x, y),
+        (5, 5),
+        textcoords="offset points",
+        fontsize=NORMAL,
+        color="white",
+        weight="bold",
+        path_effects=_outlined(),
     )
 
 

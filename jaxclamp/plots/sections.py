@@ -145,6 +145,12 @@ def _key(figure: Picture, result: Clamped, along: Axes, up: float, half_width: f
         frameon=False,
         labelcolor=INK,
     )
-    end = 0.97 * half_width
-    along.plot([end - 2.0, end], [0.0, 0.0], color=INK, linewidth=2.0, solid_capstyle="butt")
-    along.text(end - 1.0, 0.04 * up, "2 mm", ha="center", va="bottom", fontsize=SMALL, color=INK)
+    end, bar = 0.97 * half_width, _round_length(0.5 * half_width)
+    along.plot([end - bar, end], [0.0, 0.0], color=INK, linewidth=2.0, solid_capstyle="butt")
+    along.text(end - 0.5 * bar, 0.04 * up, f"{bar:g} mm", ha="center", va="bottom", fontsize=SMALL, color=INK)
+
+
+def _round_length(length: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not above a length, mm."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length))

@@ -1,0 +1,175 @@
+"""What a clamping costs. Run by `make bench`; times are of this machine, ratios are the point.
+
+One tangent should cost no more than one factorisation; the whole path no more than 80 iterations and
+2.5 times (iterations x one factorisation).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxclamp as jc
+from jaxclamp.assembly import State, linearise
+from jaxclamp.linear_solvers import LinearSolver
+from jaxclamp.model import build_model
+
+pytestmark = pytest.mark.benchmark
+
+MESHES = {"10x15x8": (10, 15, (5, 3)), "20x30x16": (20, 30, (10, 6))}
+REPEATS = 20
+
+IN_A_NEW_PROCESS = """
+import json, resource, time
+start = time.perf_counter()
+import jaxclamp as jc
+imported = time.perf_counter()
+result = jc.clamp(jc.load_scene("human-lad"))
+first = time.perf_counter()
+again = jc.clamp(jc.load_scene("human-lad"))
+second = time.perf_counter()
+print(json.dumps({
+    "import": imported - start, "first": first - imported, "second": second - first,
+    "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "solver": again.solver,
+    "cost": again.cost,
+}))
+"""
+
+
+def table(title: str, head: list[str], rows: list[list[Any]]) -> None:
+    """Print aligned columns."""
+    texts = [head] + [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row] for row in rows]
+    widths = [max(len(line[i]) for line in texts) for i in range(len(head))]
+    print(f"\n{title}")
+    for line in texts:
+        print("  " + "  ".join(text.rjust(width) for text, width in zip(line, widths, strict=True)))
+
+
+def seconds(run: Callable[[], Any]) -> float:
+    """Median time of a few runs, after one to warm up."""
+    run()
+    taken = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        run()
+        taken.append(time.perf_counter() - start)
+    return statistics.median(taken)
+
+
+def scene(counts: tuple[int, int, tuple[int, ...]]) -> jc.Scene:
+    """The seed's scene on another mesh."""
+    base = jc.load_scene("human-lad")
+    circumferential, axial, radial = counts
+    settings = dataclasses.replace(
+        base.mesh, circumferential=circumferential, axial=axial, radial=radial
+    )
+    return dataclasses.replace(base, mesh=settings)
+
+
+def clamped_state(counts: tuple[int, int, tuple[int, ...]]) -> tuple[Any, State]:
+    """The seed's stop on its own mesh; on another mesh the stress-free start is enough to time with."""
+    from jaxclamp.assembly import with_equilibrium_pressure
+    from jaxclamp.meshes import closed_positions
+
+    model = build_model(scene(counts))
+    x = closed_positions(model.mesh, model.scene.mesh, model.scene.artery)
+    return model, with_equilibrium_pressure(model.body, x, jnp.asarray(1e3))
+
+
+def test_tangent_against_factorisation():
+    rows = []
+    for name, counts in MESHES.items():
+        model, state = clamped_state(counts)
+        pressure = jnp.asarray(0.0)
+        assemble = lambda m=model, s=state, p=pressure: jax.device_get(linearise(m.body, s, p))
+        values = assemble().values
+        solver = LinearSolver(model.pattern)
+        tangent = seconds(assemble)
+        factor = seconds(lambda s=solver, v=values: s.factor(v))
+        rows.append(
+            [name, model.pattern.n, solver.name, 1e3 * tangent, 1e3 * factor, tangent / factor]
+        )
+    table(
+        "linearise against one numeric factorisation (median, ms)",
+        ["mesh", "unknowns", "solver", "linearise", "factor", "ratio"],
+        rows,
+    )
+
+
+def new_process(cache: str | None) -> dict[str, Any]:
+    """The seed's scene twice in a new process, with or without a folder of compiled kernels."""
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    if cache is not None:
+        environment["JAX_COMPILATION_CACHE_DIR"] = cache
+    done = subprocess.run(
+        [sys.executable, "-c", IN_A_NEW_PROCESS], env=environment, capture_output=True, text=True, check=True
+    )
+    return json.loads(done.stdout)
+
+
+def test_the_whole_path():
+    with tempfile.TemporaryDirectory() as cache:
+        new_process(cache)  # fills the cache
+        runs = {"no cache": new_process(None), "cache filled": new_process(cache)}
+    table(
+        "the seed's scene in a new process (s)",
+        ["", "import", "first run", "import + first", "second run", "peak memory MB"],
+        [
+            [name, r["import"], r["first"], r["import"] + r["first"], r["second"], r["memory"]]
+            for name, r in runs.items()
+        ],
+    )
+    warm = runs["cache filled"]
+    factor = warm["cost"]["factor_s"] / warm["solver"]["factorisations"]
+    iterations = warm["solver"]["newton_iterations"]
+    table(
+        "the seed's scene, warm",
+        ["wall s", "iterations", "factorisations", "load steps", "one factor ms", "wall / (iterations x factor)"],
+        [
+            [
+                warm["second"],
+                iterations,
+                warm["solver"]["factorisations"],
+                warm["solver"]["load_steps"],
+                1e3 * factor,
+                warm["second"] / (iterations * factor),
+            ]
+        ],
+    )
+
+
+@pytest.mark.slow
+def test_the_fine_mesh():
+    start = time.perf_counter()
+    result = jc.clamp(scene(MESHES["20x30x16"]))
+    table(
+        "the seed's scene on 20x30x16 elements",
+        ["first run s", "iterations", "one factor ms", "peak memory MB"],
+        [
+            [
+                time.perf_counter() - start,
+                result.solver["newton_iterations"],
+                1e3 * result.cost["factor_s"] / result.solver["factorisations"],
+                result.cost["peak_memory_MB"],
+            ]
+        ],
+    )
+
+
+if __name__ == "__main__":
+    test_tangent_against_factorisation()
+    test_the_whole_path()
+    test_the_fine_mesh()

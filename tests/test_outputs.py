@@ -1,0 +1,439 @@
+"""What a clamping leaves on disk: complete, readable by others, consistent, and all or nothing."""
+
+import csv
+import dataclasses
+import errno
+import json
+import re
+import types
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib.image
+import numpy as np
+import pytest
+
+import jaxclamp as jc
+from jaxclamp import export, fields, paraview
+from jaxclamp.assembly import with_equilibrium_pressure
+from jaxclamp.equilibrium import EquilibriumError, NotConverged
+from jaxclamp.measures import stresses
+from jaxclamp.meshes import closed_positions
+from jaxclamp.model import build_model
+from jaxclamp.report import page, write_report
+
+meshio = pytest.importorskip("meshio")
+
+FIGURES = ("axial_stress_maps", "force_travel", "sections", "stress_at_P", "wall_stress")
+COARSE = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[2, 1]"]
+LAYERS = ("media", "adventitia")
+FINAL = (
+    *("jaw_travel_mm", "lumen_height_mm", "lumen_width_mm", "occlusion", "lumen_area_mm2", "area_occlusion"),
+    *("clamp_force_N", "max_contact_pressure_kPa", "max_penetration_mm", "axial_stress_at_P_kPa"),
+    *("axial_stress_ratio_at_P", "circumferential_stress_ratio_at_P", "peak_axial_stress_kPa"),
+    *("peak_axial_stress_location_mm", "smooth_peak_axial_stress_kPa", "J_min", "J_max"),
+)
+"""keys of `final` that programs rely on"""
+
+
+@pytest.fixture(scope="module")
+def result():
+    return jc.clamp(jc.load_scene("human-lad", [*COARSE, "stop.occlusion=0.5"]))
+
+
+@pytest.fixture(scope="module")
+def folder(result, tmp_path_factory):
+    """The outputs of `result`; for reading only."""
+    target = tmp_path_factory.mktemp("outputs") / "new" / "place"
+    target_files = export.write_outputs(result, target)
+    assert all(path.is_file() for path in target_files)
+    assert set(target_files) == files_below(target)
+    return target
+
+
+def files_below(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.is_file()}
+
+
+def volumes(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, float]:
+    """Volumes of hexahedra in VTK's numbering by 2 x 2 x 2 Gauss points, and the least Jacobian."""
+    corners = np.array(
+        [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
+    )
+    total, least = np.zeros(len(cells)), np.inf
+    for gauss in corners / np.sqrt(3.0):
+        factors = 1.0 + corners * gauss
+        slopes = [corners[:, d] * np.prod(np.delete(factors, d, axis=1), axis=1) / 8.0 for d in range(3)]
+        jacobian = np.linalg.det(np.einsum("da,cai->cdi", np.array(slopes), points[cells]))
+        total, least = total + jacobian, min(least, jacobian.min())
+    return total, least
+
+
+# --------------------------------------------------------------------------------- the set of files
+
+
+def test_every_file_is_there_and_nothing_else(result, folder):
+    states = {
+        f"paraview/{part}_{i:03d}.vtu" for part in ("artery", "jaws") for i in range(len(result.states))
+    }
+    figures = {f"figures/{name}.png" for name in FIGURES}
+    expected = {"result.json", "history.csv", "report.html", "clamping.pvd"} | states | figures
+    assert {path.relative_to(folder).as_posix() for path in files_below(folder)} == expected
+
+
+def test_result_json_is_strict_and_complete(result, folder):
+    refuse = lambda text: pytest.fail(f"{text} is not JSON")
+    content = json.loads((folder / "result.json").read_text(), parse_constant=refuse)
+    assert set(content) >= {"title", "converged", "load_free", "physiological", "final", "history", "model"}
+    assert set(content) >= {"solver", "cost", "versions"}
+    assert content["converged"] is True
+    assert set(FINAL) <= set(content["final"])
+    assert all(set(content["final"]) == set(record) for record in content["history"])
+    assert content["final"] == content["history"][-1]
+    assert set(content["final"]["peak_axial_stress_kPa"]) == set(LAYERS)
+    assert content["final"]["occlusion"] == pytest.approx(0.5)
+    assert content == json.loads(json.dumps(export.plain(result.to_dict())))
+
+
+def test_history_csv_has_a_row_per_state_and_flat_columns(result, folder):
+    with (folder / "history.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(result.history)
+    assert [row["state"] for row in rows] == [str(i) for i in range(len(rows))]
+    for row, record in zip(rows, result.history, strict=True):
+        assert float(row["clamp_force_N"]) == record["clamp_force_N"]
+        assert float(row["peak_axial_stress_kPa.media"]) == record["peak_axial_stress_kPa"]["media"]
+        z = record["peak_axial_stress_location_mm"]["adventitia"][2]
+        assert float(row["peak_axial_stress_location_mm.adventitia.z"]) == z
+
+
+def test_numbers_that_json_does_not_have_become_null_and_empty():
+    record = {"a": float("nan"), "b": np.float64(2.0), "c": {"media": jnp.inf}, "n": np.int64(3), "d": None}
+    assert json.loads(export.as_json(export.plain(record))) == {
+        "a": None,
+        "b": 2.0,
+        "c": {"media": None},
+        "n": 3,
+        "d": None,
+    }
+    assert export.history_csv([record]) == "state,a,b,c.media,n,d\n0,,2.0,,3,\n"
+
+
+# --------------------------------------------------------------------------------- ParaView
+
+
+def test_index_names_every_state_of_both_parts(result, folder):
+    root = ET.parse(folder / "clamping.pvd").getroot()
+    assert (root.tag, root.attrib["type"]) == ("VTKFile", "Collection")
+    entries = [entry.attrib for entry in root.iter("DataSet")]
+    assert sorted({float(entry["timestep"]) for entry in entries}) == list(range(len(result.states)))
+    assert {(entry["part"], entry["name"]) for entry in entries} == {("0", "artery"), ("1", "jaws")}
+    assert len(entries) == 2 * len(result.states)
+    assert all((folder / entry["file"]).is_file() for entry in entries)
+
+
+@pytest.mark.parametrize("number", [0, 1, -1])
+def test_artery_is_whole_sound_and_of_the_right_volume(result, folder, number):
+    kept = result.states[number]
+    mesh = meshio.read(sorted(folder.glob("paraview/artery_*.vtu"))[number])
+    (block,) = mesh.cells
+    assert block.type == "hexahedron"
+    assert len(block.data) == 8 * result.model.mesh.n_cells
+    cell_volumes, least = volumes(mesh.points, block.data)
+    assert least > 0.0
+    J = np.asarray(stresses(result.model.body, kept.state).J)
+    modelled = float(np.sum(J * np.asarray(result.model.body.geometry.dV)))
+    assert cell_volumes.sum() == pytest.approx(8.0 * modelled, rel=1e-12)
+    stretch = kept.equilibrium.axial_stretch
+    length = float(result.scene.artery.length) * stretch
+    assert np.ptp(mesh.points[:, 2]) == pytest.approx(length)
+    np.testing.assert_allclose(mesh.points.min(0), -mesh.points.max(0), rtol=1e-12)
+    for name, values in (mesh.point_data | {k: v[0] for k, v in mesh.cell_data.items()}).items():
+        assert np.all(np.isfinite(values)), name
+    assert set(mesh.point_data) >= {*fields.STRESSES, "pressure_kPa", "displacement_mm"}
+    assert np.unique(mesh.cell_data["layer"][0]).tolist() == [1, 2]
+    assert mesh.cell_data["J"][0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_points_are_shared_inside_a_layer_and_doubled_between_layers(result, folder):
+    mesh = meshio.read(sorted(folder.glob("paraview/artery_*.vtu"))[-1])
+    cells, layer = mesh.cells[0].data, mesh.cell_data["layer"][0]
+    inner, outer = np.unique(cells[layer == 1]), np.unique(cells[layer == 2])
+    assert len(np.intersect1d(inner, outer)) == 0
+    assert len(inner) + len(outer) == len(mesh.points)
+    for points in (mesh.points[inner], mesh.points[outer]):
+        assert len(np.unique(np.round(points, 9), axis=0)) == len(points)
+    around, along = 4 * 4, 2 * 6 + 1
+    assert len(outer) == around * along * 2
+    both = np.unique(np.round(mesh.points, 9), axis=0)
+    assert len(mesh.points) - len(both) == around * along
+
+
+def test_stress_and_displacement_are_those_of_the_result(result, folder):
+    mesh = meshio.read(sorted(folder.glob("paraview/artery_*.vtu"))[-1])
+    P = [0.0, 0.5 * result.final["lumen_height_mm"], 0.0]
+    nearest = np.argmin(np.linalg.norm(mesh.points - P, axis=1))
+    assert mesh.points[nearest] == pytest.approx(P, abs=1e-12)
+    assert mesh.point_data["axial_stress_kPa"][nearest] == pytest.approx(
+        result.final["axial_stress_at_P_kPa"]
+    )
+    start = meshio.read(folder / "paraview/artery_000.vtu")
+    moved = mesh.points - start.points
+    np.testing.assert_allclose(mesh.point_data["displacement_mm"], moved, atol=1e-12)
+    assert not np.any(start.point_data["displacement_mm"])
+
+
+def test_contact_pressure_at_the_nodes_carries_the_jaw(result):
+    state = result.states[-1].state
+    pressure = fields.nodal_contact_pressure(result.model, state)
+    assert pressure.min() >= 0.0
+    assert 0.2 < pressure.max() / result.final["max_contact_pressure_kPa"] <= 1.0
+    outer = result.model.mesh.plane(0, -1)
+    assert np.all(np.isin(np.flatnonzero(pressure), outer))
+
+
+def test_jaws_are_drawn_where_the_gap_is_zero(result, folder):
+    jaw, height = result.scene.clamp.jaw, float(result.states[-1].state.jaw_height)
+    mesh = meshio.read(sorted(folder.glob("paraview/jaws_*.vtu"))[-1])
+    (block,) = mesh.cells
+    assert block.type == "quad"
+    x, y, z = mesh.points.T
+    gap = jaw.gap((jnp.asarray(x), jnp.asarray(np.abs(y) - height), jnp.asarray(z)))
+    assert np.abs(gap).max() < 1e-3
+    assert np.min(np.abs(y)) == pytest.approx(height, abs=1e-3)
+    assert (y > 0).sum() == (y < 0).sum()
+    artery = meshio.read(sorted(folder.glob("paraview/artery_*.vtu"))[-1])
+    assert x.max() > artery.points[:, 0].max()
+    opened = meshio.read(folder / "paraview/jaws_001.vtu")
+    outer = result.physiological.values["outer_radius_mm"]
+    assert np.min(np.abs(opened.points[:, 1])) == pytest.approx(outer, abs=1e-3)
+
+
+@pytest.mark.parametrize("jaw", ["cylinder-1mm", "flat-2mm", "rounded-3mm", "wide-nearly-flat"])
+def test_outline_of_every_shipped_jaw_is_a_closed_curve_on_its_face(jaw):
+    shape = jc.load_scene("human-lad", [f"clamp.jaw={jaw}"]).clamp.jaw
+    curve = fields.jaw_outline(shape, 3.0)
+    z, y = curve.T
+    assert np.array_equal(curve[0], curve[-1])
+    assert y.min() == pytest.approx(0.0, abs=1e-3)
+    lower = y < 0.999 * y.max()
+    gap = np.asarray(shape.gap((jnp.zeros(lower.sum()), jnp.asarray(y[lower]), jnp.asarray(z[lower]))))
+    assert np.abs(gap).max() < 2e-3
+    assert z.min() == pytest.approx(-z.max(), abs=1e-6)
+
+
+def test_quadratic_elements_are_written_and_mirrored_too(tmp_path):
+    scene = jc.load_scene(
+        "human-lad",
+        ["mesh.circumferential=2", "mesh.axial=2", "mesh.radial=[1, 1]", "mesh.element=q2p1"],
+    )
+    model = build_model(scene)
+    far = jnp.asarray(100.0)
+    x = closed_positions(model.mesh, scene.mesh, scene.artery)
+    kept = types.SimpleNamespace(state=with_equilibrium_pressure(model.body, x, far))
+    fake = types.SimpleNamespace(model=model, scene=scene, load_free=kept)
+    meshio.write(tmp_path / "a.vtu", paraview.artery_mesh(fake, kept))
+    (block,) = meshio.read(tmp_path / "a.vtu").cells
+    assert block.type == "hexahedron27"
+    assert block.data.shape == (8 * model.mesh.n_cells, 27)
+    for layer in map(fields.whole, fields.layer_fields(model, kept.state)):
+        points, weights = layer.element.quadrature()
+        tangents = np.einsum("qka,aci->qcki", layer.element.shape(points)[1], layer.points[layer.cells])
+        J = np.linalg.det(tangents)
+        assert J.min() > 0.0
+        modelled = (weights @ J)[: model.mesh.layer_cells[0][1]].sum()
+        assert (weights @ J).sum() == pytest.approx(8.0 * modelled)
+    # corners, then edges: each of VTK's mid-edge points lies near the middle of its edge
+    grid = model.mesh.element.node_grid[list(model.mesh.element.meshio_nodes)]
+    edges = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
+    for number, (a, b) in enumerate(edges, start=8):
+        assert np.array_equal(2 * grid[number], grid[a] + grid[b])
+
+
+def test_an_artery_too_fine_to_show_whole_is_written_as_the_modelled_part(result, tmp_path, monkeypatch):
+    monkeypatch.setattr(paraview, "LARGEST_WHOLE", 100)
+    files = paraview.write_states(result, tmp_path)
+    artery, jaws = meshio.read(files[0]), meshio.read(files[1])
+    assert len(artery.cells[0].data) == result.model.mesh.n_cells
+    assert volumes(artery.points, artery.cells[0].data)[1] > 0.0
+    assert jaws.points[:, 1].min() > 0.0
+
+
+# --------------------------------------------------------------------------------- figures and report
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figures_show_something(folder, name):
+    image = matplotlib.image.imread(folder / "figures" / f"{name}.png")
+    assert image.shape[0] > 400
+    assert image.shape[1] > 900
+    assert image[..., :3].std() > 0.08
+    border = np.concatenate(
+        [image[:2].reshape(-1, 4), image[-2:].reshape(-1, 4), image[:, :2].reshape(-1, 4)]
+    )
+    assert np.all(border[:, :3] > 0.95), "something is cut off at the edge"
+
+
+def test_figures_leave_matplotlib_alone(result):
+    from matplotlib import _pylab_helpers, rcParams
+
+    before = dict(rcParams)
+    for name in FIGURES:
+        figure = getattr(result, f"plot_{name}")()
+        assert figure.axes
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    assert dict(rcParams) == before
+    assert not _pylab_helpers.Gcf.figs
+
+
+class Page(HTMLParser):
+    """Tags in order, and links to anything."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.links += [value for name, value in attributes if name in ("src", "href", "data", "action")]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_report_stands_alone(folder):
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    parsed = Page(text)
+    assert parsed.open == []
+    assert parsed.tags.count("img") == len(FIGURES)
+    assert all(link.startswith("data:image/png;base64,") for link in parsed.links)
+    assert not {"script", "link", "iframe", "object"} & set(parsed.tags)
+    assert "://" not in text
+    assert "url(" not in text
+    assert not re.search(r"\b(nan|None|inf)\b", re.sub(r"base64,[^\"]*", "", text))
+    for said in (
+        "Human LAD between two cylinders",
+        "negative pivots",
+        "opening_angle_deg",
+        "newton iterations",
+    ):
+        assert said in text
+
+
+def test_report_escapes_what_it_is_told(result):
+    nasty = '<script>alert("1")</script> & co'
+    scene = jc.replace(result.scene, "title", nasty)
+    text = page(dataclasses.replace(result, model=dataclasses.replace(result.model, scene=scene)), [])
+    assert "<script" not in text
+    assert "&lt;script&gt;" in text
+    assert Page(text).open == []
+
+
+def test_report_can_be_written_alone(result, tmp_path):
+    path = write_report(result, tmp_path / "report.html")
+    assert Page(path.read_text(encoding="utf-8")).tags.count("img") == len(FIGURES)
+
+
+# --------------------------------------------------------------------------------- what did not converge
+
+
+@pytest.mark.parametrize("kept", [0, 1, 2, 5])
+def test_whatever_converged_is_written(result, tmp_path, kept):
+    failure = EquilibriumError(
+        "clamping", "beyond occlusion 12 %", NotConverged("cut", 1.0, 0.5), "refine the mesh"
+    )
+    files = export.write_outputs(
+        dataclasses.replace(result, states=result.states[:kept], failure=failure), tmp_path
+    )
+    assert set(files) == files_below(tmp_path)
+    content = json.loads((tmp_path / "result.json").read_text())
+    assert content["converged"] is False
+    assert len(list(tmp_path.glob("paraview/artery_*.vtu"))) == kept
+    assert len(list(tmp_path.glob("figures/*.png"))) == (0, 1, 5, 5)[min(kept, 3)]
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "The stop was not reached" in text
+    assert "refine the mesh" in text
+
+
+def test_shown_states_are_spread_evenly_and_few():
+    assert fields.spread([0.0], 6) == [0]
+    assert fields.spread([0.0, 1.0], 6) == [0, 1]
+    assert fields.spread([0.0, 0.1, 1.0, 2.1, 2.9, 4.0, 4.6, 5.0], 6) == [0, 2, 3, 4, 5, 7]
+    assert fields.spread([0.0, 0.0, 1.0, 1.0, 1.0], 3) == [0, 4]
+    assert len(fields.spread([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 5.0, 5.0], 6)) == 6
+
+
+def test_figures_that_need_more_states_say_so(result):
+    only = dataclasses.replace(result, states=result.states[:1])
+    only.plot_wall_stress()
+    for name in FIGURES[:-1]:
+        with pytest.raises(ValueError, match="did not converge"):
+            getattr(only, f"plot_{name}")()
+
+
+# --------------------------------------------------------------------------------- all or nothing
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files_below(folder)}
+
+
+def full_disk(*args, **kwargs):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("stage", ["meshio.write", "jaxclamp.report.page", "jaxclamp.export.history_csv"])
+def test_a_full_disk_leaves_nothing_behind(result, tmp_path, monkeypatch, stage):
+    monkeypatch.setattr(stage, full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        export.write_outputs(result, tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_or_an_interruption_leaves_earlier_results_as_they_were(result, tmp_path, monkeypatch):
+    few = dataclasses.replace(result, states=result.states[:2])
+    export.write_outputs(few, tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    before = snapshot(tmp_path)
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    for failing in (full_disk, interrupt):
+        monkeypatch.setattr("jaxclamp.export.as_json", failing)
+        with pytest.raises((OSError, KeyboardInterrupt)):
+            export.write_outputs(few, tmp_path)
+        assert snapshot(tmp_path) == before
+        assert not list(tmp_path.glob(".*"))
+
+
+def test_an_earlier_result_with_more_states_is_replaced_as_a_whole(result, folder, tmp_path):
+    export.write_outputs(result, tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    files = export.write_outputs(dataclasses.replace(result, states=result.states[:1]), tmp_path)
+    assert files_below(tmp_path) == {*files, tmp_path / "notes.txt"}
+    assert len(list(tmp_path.glob("paraview/*.vtu"))) == 2
+    assert len(list(tmp_path.glob("figures/*.png"))) == 1
+
+
+def test_a_file_in_place_of_the_folder_is_refused(result, tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    with pytest.raises(OSError, match="taken"):
+        export.write_outputs(result, tmp_path / "taken")
+    assert snapshot(tmp_path) == {"taken": b"mine"}
+
+
+def test_progress_is_told(result, tmp_path):
+    events = []
+    export.write_outputs(dataclasses.replace(result, states=result.states[:2]), tmp_path, events.append)
+    fractions = [event.fraction for event in events]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert {event.stage for event in events} == {"writing"}
