@@ -172,7 +172,7 @@ class _Walk:
             condition = lambda s: JawForce(force + s * (wanted - force), scale)  # noqa: E731
             return (lambda s: self.step(condition(s))), never
         target = (1.0 - NEARLY_CLOSED) * self.lumen_radius
-        if height <= target:
+        if height <= target * (1.0 + 1e-6):
             reason = f"{force * PARTS_OF_A_JAW * 1e-3:.3g} N is all it takes to {NEARLY_CLOSED:.0%} occlusion"
             raise self.error("clamping", now, NotConverged(reason))
         return (

@@ -68,9 +68,9 @@ class NeoHookean(Material):
     """Isotropic ground substance only: c/2 (I1_bar - 3)."""
 
     law: str = static("neo-hookean")
-    c: Array = quantity("kPa", 0.0, 1e9, open_lower=True)
+    c: Array = quantity("kPa", 1e-6, 1e9)
     """shear modulus"""
-    bulk: Array = quantity("kPa", 0.0, 1e12, open_lower=True)
+    bulk: Array = quantity("kPa", 1e-3, 1e12)
     """bulk modulus, the penalty on the change of volume"""
 
     def psi_bar(self, F: Tensor) -> Array:
@@ -90,7 +90,7 @@ class HGO(Material):
     """
 
     law: str = static("hgo")
-    c: Array = quantity("kPa", 0.0, 1e9, open_lower=True)
+    c: Array = quantity("kPa", 1e-6, 1e9)
     """shear modulus of the ground substance"""
     k1: Array = quantity("kPa", 0.0, 1e9)
     """fibre stiffness"""
@@ -98,7 +98,7 @@ class HGO(Material):
     """fibre stiffening, no unit"""
     fibre_angle: Array = quantity("deg", 0.0, 90.0)
     """angle of both families from the circumferential direction"""
-    bulk: Array = quantity("kPa", 0.0, 1e12, open_lower=True)
+    bulk: Array = quantity("kPa", 1e-3, 1e12)
     """bulk modulus, the penalty on the change of volume"""
     fibre_energy: str = static("eq4", choices=("eq4", "eq10"))
     fibre_invariant: str = static("isochoric", choices=("isochoric", "full"))
@@ -125,7 +125,7 @@ class GOH(Material):
     """
 
     law: str = static("goh")
-    c: Array = quantity("kPa", 0.0, 1e9, open_lower=True)
+    c: Array = quantity("kPa", 1e-6, 1e9)
     """shear modulus of the ground substance"""
     k1: Array = quantity("kPa", 0.0, 1e9)
     """fibre stiffness"""
@@ -135,7 +135,7 @@ class GOH(Material):
     """0: all fibres along the mean direction; 1/3: equally in all directions"""
     fibre_angle: Array = quantity("deg", 0.0, 90.0)
     """mean angle of both families from the circumferential direction"""
-    bulk: Array = quantity("kPa", 0.0, 1e12, open_lower=True)
+    bulk: Array = quantity("kPa", 1e-3, 1e12)
     """bulk modulus, the penalty on the change of volume"""
 
     def psi_bar(self, F: Tensor) -> Array:

@@ -21,7 +21,17 @@ from jaxclamp.assembly import Body, State, at_points, contact_potential, gaps, p
 from jaxclamp.elements import Element, gauss, lagrange, tensor_rule
 from jaxclamp.meshes import Mesh
 from jaxclamp.pytree import record, static
-from jaxclamp.tensors import cross, det, norm, product, smooth_maximum, stacked, total, transpose
+from jaxclamp.tensors import (
+    cross,
+    det,
+    largest_eigenvalue,
+    norm,
+    product,
+    smooth_maximum,
+    stacked,
+    total,
+    transpose,
+)
 
 PARTS = 8
 """the model is one eighth of the artery"""
@@ -130,7 +140,7 @@ def stresses(body: Body, state: State) -> Stresses:
         circumferential=along(F, sigma, 1),
         axial=sigma[2, 2],
         radial=along(F, sigma, 0),
-        greatest=jnp.linalg.eigvalsh(jnp.moveaxis(sigma, (0, 1), (-2, -1)))[..., -1],
+        greatest=largest_eigenvalue(sigma),
         J=det(F),
     )
 

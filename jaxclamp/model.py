@@ -91,10 +91,14 @@ def terms(scene: Scene) -> dict[str, str]:
     return found
 
 
-SECONDS = {"q1p0": 1.4e-6, "q2p1": 4e-6}
-"""time of a clamping per unknown to the power 1.35 x 100 Newton iterations (measured; see the README)"""
-MEMORY_PER_UNKNOWN = 0.055
-"""MB, beside the 450 MB that Python and the compiled program take (measured)"""
+USUAL_ITERATIONS = 100
+"""Newton iterations of a whole clamping, on any mesh"""
+START_SECONDS = 8.0
+"""compilation and output, s"""
+ITERATION_SECONDS, ITERATION_EXPONENT = 2.1e-7, 1.47
+"""time of an iteration: factor times unknowns to the exponent, s (two meshes, two cores of 2024)"""
+START_MEMORY, MEMORY_PER_UNKNOWN = 500.0, 0.04
+"""MB: Python with the compiled programs, and what the factors add (the same two meshes)"""
 
 
 def describe(scene: Scene) -> dict[str, Any]:
@@ -116,10 +120,17 @@ def describe(scene: Scene) -> dict[str, Any]:
         "linear_solver": available()[0]
         if scene.solver.linear_solver == "auto"
         else scene.solver.linear_solver,
-        "predicted_seconds": float(f"{3.0 + 100 * SECONDS[scene.mesh.element] * unknowns**1.35:.2g}"),
-        "predicted_memory_MB": float(f"{450.0 + MEMORY_PER_UNKNOWN * unknowns:.2g}"),
+        "predicted_seconds": _rounded(
+            START_SECONDS + USUAL_ITERATIONS * ITERATION_SECONDS * unknowns**ITERATION_EXPONENT
+        ),
+        "predicted_memory_MB": _rounded(START_MEMORY + MEMORY_PER_UNKNOWN * unknowns),
         "warnings": warnings(scene, mesh),
     }
+
+
+def _rounded(estimate: float) -> float:
+    """Two significant digits: it is no more than an estimate."""
+    return float(f"{estimate:.2g}")
 
 
 def warnings(scene: Scene, mesh: Mesh) -> list[str]:

@@ -59,7 +59,7 @@ class OcclusionStop:
     """Close until 1 - lumen height / physiological lumen diameter, at mid-length, is reached."""
 
     kind: str = static("occlusion")
-    occlusion: Array = quantity("", 0.0, 0.999, open_lower=True)
+    occlusion: Array = quantity("", 1e-4, 0.999)
 
 
 @record
@@ -75,7 +75,7 @@ class ForceStop:
     """Close until the force on one jaw (whole artery) is reached."""
 
     kind: str = static("force")
-    force: Array = quantity("N", 0.0, 1e4, open_lower=True)
+    force: Array = quantity("N", 1e-6, 1e4)
 
 
 Stop = OcclusionStop | TravelStop | ForceStop

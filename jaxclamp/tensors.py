@@ -70,6 +70,16 @@ def inverse(A: Tensor) -> Array:
     return jnp.stack([jnp.stack([cofactors[j][i] for j in range(3)]) for i in range(3)]) / det(A)
 
 
+def largest_eigenvalue(A: Tensor) -> Array:
+    """Largest eigenvalue of a symmetric A: m + 2 q cos(arccos(r) / 3), Smith, Commun ACM 4 (1961) 168."""
+    m = (A[0, 0] + A[1, 1] + A[2, 2]) / 3.0
+    B = {(i, j): A[i, j] - m if i == j else A[i, j] for i in range(3) for j in range(3)}
+    q = safe_sqrt(squared_norm(B) / 6.0)
+    scale = jnp.where(q > 0.0, q, 1.0)
+    r = jnp.clip(det({key: value / scale for key, value in B.items()}) / 2.0, -1.0, 1.0)
+    return m + 2.0 * q * jnp.cos(jnp.arccos(r) / 3.0)
+
+
 def safe_sqrt(s: Array) -> Array:
     """sqrt(s), with value and derivative 0 where s = 0."""
     positive = s > 0.0

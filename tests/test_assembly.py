@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from walks import mesh
 
 import jaxclamp as jc
 from jaxclamp.assembly import State, advance, linearise, potential, supported, with_equilibrium_pressure
@@ -19,9 +18,11 @@ from jaxclamp.materials import GOH, HGO, NeoHookean
 from jaxclamp.meshes import closed_positions
 from jaxclamp.model import build_model
 from jaxclamp.scene import Layer
+from walks import mesh
 
 PRESSURE = 13.33
 FAR = 1e3
+
 
 @jax.jit
 def derivatives(body, x, jaw_height, pressure, v):
@@ -80,7 +81,9 @@ class Setup:
         closed = np.asarray(closed_positions(self.mesh, self.scene.mesh, artery))
         rng = np.random.default_rng(3)
         size = 0.04 if element == "q1p0" else 0.015
-        moved = closed * np.array([1.05, 0.98, 1.0]) + size * rng.uniform(-1.0, 1.0, closed.shape) * ~self.held
+        moved = (
+            closed * np.array([1.05, 0.98, 1.0]) + size * rng.uniform(-1.0, 1.0, closed.shape) * ~self.held
+        )
         self.x = jnp.asarray(moved)
         self.jaw_height = jnp.asarray(float(moved[:, 1].max()) - 0.3)
         self.state = with_equilibrium_pressure(self.body, self.x, self.jaw_height)
@@ -216,7 +219,9 @@ def test_jaw_terms_are_derivatives_with_respect_to_its_height(setup):
     assert size > 0.0
     np.testing.assert_allclose(setup.lin.jaw_coupling, coupling, rtol=0.0, atol=1e-6 * size)
     force = [
-        float(linearise(setup.body, State(x=setup.x, p=setup.state.p, jaw_height=d), setup.pressure).jaw_force)
+        float(
+            linearise(setup.body, State(x=setup.x, p=setup.state.p, jaw_height=d), setup.pressure).jaw_force
+        )
         for d in (up, down)
     ]
     assert setup.lin.jaw_stiffness == pytest.approx(-(force[0] - force[1]) / (2.0 * h), rel=1e-6)
@@ -246,7 +251,9 @@ def test_rigid_motions_need_no_force(setup):
 
 def lumen_volume(setup, x) -> float:
     """Volume under pressure: the potential is linear in it."""
-    without, with_unit = (float(forces(setup.body, x, jnp.asarray(FAR), jnp.asarray(p))[0]) for p in (0.0, 1.0))
+    without, with_unit = (
+        float(forces(setup.body, x, jnp.asarray(FAR), jnp.asarray(p))[0]) for p in (0.0, 1.0)
+    )
     return without - with_unit
 
 
@@ -272,7 +279,9 @@ def test_pressure_force_is_pressure_times_deformed_area_normal(setup):
     m = setup.mesh.element.order
     nodes = np.linspace(-1.0, 1.0, m + 1)
     points, weights = np.polynomial.legendre.leggauss(6)
-    values = np.array([[np.prod([(s - b) / (a - b) for b in nodes if b != a]) for a in nodes] for s in points])
+    values = np.array(
+        [[np.prod([(s - b) / (a - b) for b in nodes if b != a]) for a in nodes] for s in points]
+    )
     slopes = np.array([np.polyval(np.polyder(np.polyfit(nodes, row, m)), points) for row in np.eye(m + 1)]).T
     grid = setup.mesh.grid
     lumen = np.array([[setup.mesh.node(0, c, z) for z in range(grid[2])] for c in range(grid[1])])

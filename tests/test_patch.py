@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from walks import mesh
 
 import jaxclamp as jc
 from jaxclamp import assembly, energies
@@ -16,6 +15,7 @@ from jaxclamp.linear_solvers import LinearSolver
 from jaxclamp.materials import HGO
 from jaxclamp.measures import cauchy_stress
 from jaxclamp.meshes import build_mesh
+from walks import mesh
 
 MATERIAL = HGO(c=27.0, k1=5.1, k2=1.0, fibre_angle=0.5, bulk=1e4)
 FAR = 1e3
@@ -53,14 +53,16 @@ class Patch:
         self.spacing = spacing
 
         X = jnp.moveaxis(jnp.asarray(self.X)[self.mesh.cells], -1, 0)
-        axes = jnp.broadcast_to(jnp.eye(3)[:, :, None, None], (3, 3, 8 if element == "q1p0" else 27, X.shape[2]))
+        axes = jnp.broadcast_to(
+            jnp.eye(3)[:, :, None, None], (3, 3, 8 if element == "q1p0" else 27, X.shape[2])
+        )
         monkeypatch.setattr(energies, "stress_free_positions", lambda *_: X)
         monkeypatch.setattr(energies, "_cylindrical_axes", lambda _: axes)
-        monkeypatch.setattr(
-            assembly, "supported", lambda _: np.repeat(~self.inner[:, None], 3, axis=1)
-        )
+        monkeypatch.setattr(assembly, "supported", lambda _: np.repeat(~self.inner[:, None], 3, axis=1))
         scene = jc.load_scene("human-lad")
-        artery = jc.replace(scene.artery, "layers", (jc.replace(scene.artery.layers[0], "material", MATERIAL),))
+        artery = jc.replace(
+            scene.artery, "layers", (jc.replace(scene.artery.layers[0], "material", MATERIAL),)
+        )
         topology, self.pattern = build_topology(self.mesh)
         parameters = Parameters(materials=(MATERIAL,), contact=scene.contact, jaw=scene.clamp.jaw)
         body = Body(
@@ -125,7 +127,9 @@ def enclosed_volume(patch) -> float:
     m = patch.mesh.element.order
     nodes = np.linspace(-1.0, 1.0, m + 1)
     points, weights = np.polynomial.legendre.leggauss(6)
-    values = np.array([[np.prod([(s - b) / (a - b) for b in nodes if b != a]) for a in nodes] for s in points])
+    values = np.array(
+        [[np.prod([(s - b) / (a - b) for b in nodes if b != a]) for a in nodes] for s in points]
+    )
     slopes = np.array([np.polyval(np.polyder(np.polyfit(nodes, row, m)), points) for row in np.eye(m + 1)]).T
     grid = patch.mesh.grid
     X = patch.X.reshape(*grid[::-1], 3).transpose(2, 1, 0, 3)  # [r, c, z]

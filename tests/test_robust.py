@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-from walks import mesh
 
 import jaxclamp as jc
 from jaxclamp.jaws import Cylinder, Flat, Jaw
+from walks import mesh
 
 MESHES = {"10x15x8": (10, 15, (5, 3)), "10x30x8": (10, 30, (5, 3)), "20x30x16": (20, 30, (10, 6))}
 

@@ -263,3 +263,12 @@ def test_smooth_maximum_of_nothing_is_zero():
     value, gradient = jax.value_and_grad(tensors.smooth_maximum)(v, w, 20.0)
     assert float(value) == 0.0
     assert np.all(np.isfinite(gradient))
+
+
+def test_largest_eigenvalue_agrees_with_lapack():
+    rng = np.random.default_rng(5)
+    A = rng.normal(size=(200, 3, 3))
+    A = A + np.swapaxes(A, 1, 2)
+    A[0], A[1] = 3.0 * np.eye(3), np.diag([2.0, 2.0, -1.0])  # a triple and a double eigenvalue
+    found = tensors.largest_eigenvalue(jnp.asarray(np.moveaxis(A, 0, -1)))
+    np.testing.assert_allclose(found, np.linalg.eigvalsh(A)[:, -1], atol=1e-12)

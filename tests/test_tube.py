@@ -8,11 +8,21 @@ import math
 
 import numpy as np
 import pytest
-from tube import ADVENTITIA, MEDIA, RING, SEED, SEED_PRESSURE, SEED_STRETCH, Compressible, Incompressible, Sector
-from walks import inflate, mesh, tube_scene
 
 from jaxclamp.measures import stresses
 from jaxclamp.meshes import stress_free_positions
+from tube import (
+    ADVENTITIA,
+    MEDIA,
+    RING,
+    SEED,
+    SEED_PRESSURE,
+    SEED_STRETCH,
+    Compressible,
+    Incompressible,
+    Sector,
+)
+from walks import inflate, mesh, tube_scene
 
 BULK = 1e4
 
@@ -45,7 +55,9 @@ def drawn(seed: int) -> tuple[tuple[Sector, Sector], float, float]:
     angle, thickness = rng.uniform(0.0, 160.0), rng.uniform(0.15, 0.35)
     k = 360.0 / (360.0 - angle)
     fit = rng.uniform(0.97, 1.03)
-    outer = Sector(fit * (closed_outer + 0.5 * thickness) * k - 0.5 * thickness, thickness, angle, *material())
+    outer = Sector(
+        fit * (closed_outer + 0.5 * thickness) * k - 0.5 * thickness, thickness, angle, *material()
+    )
     return (inner, outer), rng.uniform(6.0, 16.0), rng.uniform(1.0, 1.25)
 
 
@@ -110,9 +122,7 @@ def compare(model, state, exact: Compressible) -> Errors:
     ring = np.asarray(state.x)[model.marks.lumen_ring]
     radius = np.mean(np.hypot(ring[:, 0], ring[:, 1]))
     root = {name: math.sqrt(square / squares["exact"]) for name, square in squares.items()}
-    return Errors(
-        radius / exact.inner_radius - 1.0, root["circumferential"], root["axial"], root["radial"]
-    )
+    return Errors(radius / exact.inner_radius - 1.0, root["circumferential"], root["axial"], root["radial"])
 
 
 def rate(coarse: float, fine: float) -> float:

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from tube import ADVENTITIA, MEDIA, RING, SEED, SEED_EQ10, Compressible, Incompressible, Sector
 
 # Human LAD of 2002, incompressible, by an independent quadrature; printed digits are exact
@@ -83,9 +84,7 @@ def test_neo_hookean_ring_in_closed_form():
 def test_layers_of_one_material_are_one_layer():
     cut = 0.3
     inner = dataclasses.replace(MEDIA, thickness=cut)
-    outer = dataclasses.replace(
-        MEDIA, inner_radius=MEDIA.inner_radius + cut, thickness=MEDIA.thickness - cut
-    )
+    outer = dataclasses.replace(MEDIA, inner_radius=MEDIA.inner_radius + cut, thickness=MEDIA.thickness - cut)
     for tube in (Incompressible, lambda *a: Compressible(*a, 1e4)):
         whole, parts = tube((MEDIA,), 10.0, 1.1), tube((inner, outer), 10.0, 1.1)
         assert parts.inner_radius == pytest.approx(whole.inner_radius, abs=1e-9)

@@ -138,7 +138,12 @@ class Compressible:
     """The same tube with U(J) = bulk/2 (J - 1)**2 and fibres stretched by J**(-1/3) F."""
 
     def __init__(
-        self, layers: tuple[Sector, ...], pressure: float, stretch: float, bulk: float, tolerance: float = 1e-11
+        self,
+        layers: tuple[Sector, ...],
+        pressure: float,
+        stretch: float,
+        bulk: float,
+        tolerance: float = 1e-11,
     ) -> None:
         self.layers, self.pressure, self.stretch, self.bulk = layers, pressure, stretch, bulk
         self.tolerance = tolerance

@@ -16,7 +16,9 @@ from jaxclamp.scene import Layer, MeshSettings, Scene
 from tube import Sector
 
 
-def mesh(element: str, circumferential: int, axial: int, radial: tuple[int, ...], **others: Any) -> MeshSettings:
+def mesh(
+    element: str, circumferential: int, axial: int, radial: tuple[int, ...], **others: Any
+) -> MeshSettings:
     """Mesh settings by position."""
     return MeshSettings(
         element=element, circumferential=circumferential, axial=axial, radial=radial, **others
