@@ -241,7 +241,7 @@ def _scatter(nodes: AnyArray, values: Array, n_nodes: int) -> Array:
     return jnp.zeros((n_nodes, 3)).at[nodes].add(jnp.swapaxes(values, 1, 2))
 
 
-def _lumen(body: Body, pressure: Array) -> Density:
+def _lumen(body: Body, pressure: Array | float) -> Density:
     n = round(body.stencils.lumen.shape[0] ** 0.5)
     weights = jnp.asarray(tensor_rule((n, n))[1])[:, None]
     return lambda y: -pressure * lumen_density(y, weights)
@@ -282,10 +282,13 @@ def potential(body: Body, x: Array, jaw_height: Array, pressure: Array) -> Array
         )
         for material, (first, last) in zip(body.parameters.materials, body.topology.layer_cells, strict=True)
     )
-    lumen = jnp.sum(
-        _lumen(body, pressure)(at_points(body.stencils.lumen, _gather(x, body.topology.lumen_facets)))
-    )
-    return wall + volumetric + lumen + contact_potential(body, x, jaw_height)
+    return wall + volumetric - pressure * lumen_volume(body, x) + contact_potential(body, x, jaw_height)
+
+
+def lumen_volume(body: Body, x: Array) -> Array:
+    """Volume of the modelled part of the lumen, mm^3."""
+    y = at_points(body.stencils.lumen, _gather(x, body.topology.lumen_facets))
+    return jnp.sum(_lumen(body, -1.0)(y))
 
 
 def contact_potential(body: Body, x: Array, jaw_height: Array) -> Array:

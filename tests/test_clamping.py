@@ -15,7 +15,7 @@ from jaxclamp.jaws import Flat, Spline
 from jaxclamp.linear_solvers import available
 from jaxclamp.materials import GOH, NeoHookean
 from jaxclamp.scene import ForceStop, OcclusionStop, TravelStop
-from tube import MEDIA, SEED_PRESSURE, SEED_STRETCH, Compressible
+from tube import MEDIA, SEED_STRETCH, Compressible
 from walks import mesh
 
 OCCLUSION = 0.8
@@ -227,21 +227,23 @@ def test_a_stop_out_of_reach_keeps_what_converged(stop):
 
 
 def test_one_layer_with_printed_equation_10_and_a_spline_jaw():
-    """The media alone; its fibres are softer by Eq. (10), so that it is wider than by Eq. (4)."""
+    """The media alone at 4 kPa; its fibres are softer by Eq. (10), so that it is wider than by Eq. (4)."""
     media = small().artery.layers[0]
     printed = dataclasses.replace(media, material=dataclasses.replace(media.material, fibre_energy="eq10"))
     jaw = Spline(half_width=2.5, slopes=np.array([0.05, 0.15, 0.3, 0.5]), edge_radius=1.0)
-    result = jc.clamp(small(artery__layers=(printed,), mesh__radial=(3,), clamp__jaw=jaw))
+    result = jc.clamp(
+        small(artery__layers=(printed,), artery__pressure=4.0, mesh__radial=(3,), clamp__jaw=jaw)
+    )
     assert_sound(result)
     assert set(result.final["peak_axial_stress_kPa"]) == {"media"}
     assert result.final["occlusion"] == pytest.approx(OCCLUSION, abs=1e-7)
     radii = [
-        Compressible((dataclasses.replace(MEDIA, law=law),), SEED_PRESSURE, SEED_STRETCH, 1e4).inner_radius
+        Compressible((dataclasses.replace(MEDIA, law=law),), 4.0, SEED_STRETCH, 1e4).inner_radius
         for law in ("eq4", "eq10")
     ]
     radius = 0.5 * result.history[0]["lumen_height_mm"]
     assert radius == pytest.approx(radii[1], rel=3e-3)  # of the mesh, see the tube's convergence
-    assert abs(radii[0] / radii[1] - 1.0) > 6e-3
+    assert abs(radii[0] / radii[1] - 1.0) > 1.5e-2
 
 
 @pytest.mark.slow

@@ -42,7 +42,9 @@ class FakeResult:
 
 
 def failed():
-    return EquilibriumError("clamping", "beyond 91 % occlusion", NotConverged("cut", 1.0, 0.2), "refine the mesh")
+    return EquilibriumError(
+        "clamping", "beyond 91 % occlusion", NotConverged("cut", 1.0, 0.2), "refine the mesh"
+    )
 
 
 class Engine:
