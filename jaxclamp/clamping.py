@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -32,7 +31,7 @@ from jaxclamp.equilibrium import (
 from jaxclamp.linear_solvers import LinearSolver
 from jaxclamp.measures import PARTS_OF_A_JAW, observe
 from jaxclamp.meshes import closed_positions
-from jaxclamp.model import Model, build_model
+from jaxclamp.model import Model, build_model, same_kind
 from jaxclamp.results import Kept, Result, work_balance
 from jaxclamp.scene import ForceStop, OcclusionStop, Scene, TravelStop
 
@@ -40,6 +39,8 @@ FIRST_TOUCH = 0.02
 """the first closing step, as part of the outer radius: enough to bring points into contact"""
 NEARLY_CLOSED = 0.99
 """a force stop is sought up to this occlusion"""
+LARGEST_OVERLAP = 1e-6
+"""opposite inner walls may overlap by this part of the lumen radius"""
 SMALLEST_SHARE = 1 / 16
 """a neighbour's solution is followed in steps of at least this share of the way, or given up"""
 RESCUE_MOVE = 0.02
@@ -61,10 +62,9 @@ class Progress:
 class _Walk:
     """One clamping under way: the system, what has converged so far, and whom to tell."""
 
-    def __init__(self, model: Model, report: Callable[[Progress], None]) -> None:
-        self.model, self.report = model, report
+    def __init__(self, model: Model, report: Callable[[Progress], Any], start: float) -> None:
+        self.model, self.report, self.start = model, report, start
         self.states: list[Kept] = []
-        self.start = time.perf_counter()
         settings = model.scene.solver
         self.system = System(
             body=model.body,
@@ -76,11 +76,23 @@ class _Walk:
 
     def keep(self, stage: str, equilibrium: Equilibrium, fraction: float, message: str) -> None:
         """Read a converged state off, remember it, and report progress."""
-        values = observe(
-            self.model.body, equilibrium.state, jnp.asarray(equilibrium.pressure), self.model.marks
+        values = _to_floats(
+            observe(self.model.body, equilibrium.state, jnp.asarray(equilibrium.pressure), self.model.marks)
         )
-        self.states.append(Kept(stage, equilibrium, _to_floats(values)))
+        if stage == "clamping":
+            self.check(values)
+        self.states.append(Kept(stage, equilibrium, values))
         self.report(Progress(stage, fraction, message))
+
+    def check(self, values: dict[str, Any]) -> None:
+        """Refuse a closing state that the model does not cover. Raises EquilibriumError."""
+        reason = None
+        if values["lumen_overlap_mm"] > LARGEST_OVERLAP * self.lumen_radius:
+            reason = "the inner walls meet, and their contact is not modelled"
+        elif values["max_penetration_mm"] > 0.5 * (self.outer_radius - self.lumen_radius):
+            reason = "the jaws sink into the wall: raise contact.stiffness_kPa_per_mm"
+        if reason is not None:
+            raise self.error("clamping", self.states[-1].equilibrium, NotConverged(reason))
 
     # --- the three stages -----------------------------------------------------------------------
 
@@ -125,10 +137,12 @@ class _Walk:
         scene = self.model.scene
         self.refer_to(physiological)
         stop = scene.stop
-        if isinstance(stop, TravelStop) and float(stop.travel) <= FIRST_TOUCH * self.outer_radius:
-            touch = self.outer_radius - float(stop.travel)
-        else:
-            touch = (1.0 - FIRST_TOUCH) * self.outer_radius
+        move = FIRST_TOUCH * self.outer_radius
+        if isinstance(stop, TravelStop):
+            move = min(move, float(stop.travel))
+        elif isinstance(stop, OcclusionStop):
+            move = min(move, 0.5 * float(stop.occlusion) * self.lumen_radius)
+        touch = self.outer_radius - move
         start = dataclasses.replace(physiological.state, jaw_height=jnp.asarray(touch))
         equilibrium = self.solve_or_descend(
             "clamping", start, self.held(touch), f"first contact, jaw height {touch:.3f} mm"
@@ -213,12 +227,7 @@ class _Walk:
         return float(equilibrium.state.x[self.model.marks.lumen_top, 1])
 
     def tell_closing(self, s: float, equilibrium: Equilibrium) -> None:
-        """Keep a closing state; refuse one in which the intima would have passed the mid-plane."""
-        if self.top(equilibrium) <= 0.0:
-            reason = NotConverged(
-                "the lumen closes before the stop, and contact of the intima is not modelled"
-            )
-            raise self.error("clamping", self.states[-1].equilibrium, reason)
+        """Keep a closing state and report it."""
         occlusion = 1.0 - self.top(equilibrium) / self.lumen_radius
         force = float(equilibrium.lin.jaw_force) * PARTS_OF_A_JAW * 1e-3
         note = ", snapped" if equilibrium.snapped else ""
@@ -226,6 +235,9 @@ class _Walk:
         self.keep("clamping", equilibrium, self.closed_fraction(equilibrium), message)
 
     def closed_fraction(self, equilibrium: Equilibrium) -> float:
+        return min(max(self._share_of_stop(equilibrium), 0.0), 1.0)
+
+    def _share_of_stop(self, equilibrium: Equilibrium) -> float:
         stop = self.model.scene.stop
         if isinstance(stop, OcclusionStop):
             return (1.0 - self.top(equilibrium) / self.lumen_radius) / float(stop.occlusion)
@@ -317,10 +329,11 @@ def clamp(
 
     Raises EquilibriumError if the stop is not reached; its `result` keeps what did converge.
     """
-    like = None if guess is None else guess.model
-    model = build_model(scene, like)
-    walk = _Walk(model, _reporter(progress))
-    warm = guess if guess is not None and guess.converged and model.mesh is guess.model.mesh else None
+    start = time.perf_counter()
+    model = build_model(scene, None if guess is None else guess.model)
+    walk = _Walk(model, _reporter(progress), start)
+    neighbour = guess is not None and guess.converged and same_kind(scene, guess.scene)
+    warm = guess if neighbour else None
     try:
         if warm is not None and _warm(walk, warm):
             return _result(walk, None)
@@ -360,7 +373,10 @@ def _warm(walk: _Walk, guess: Result) -> bool:
                 return False
             continue
         reached, load_free, base, last = t, new_load_free, new_base, found
-    walk.keep("clamping", last, 1.0, "from a neighbouring solution")
+    try:
+        walk.keep("clamping", last, 1.0, "from a neighbouring solution")
+    except EquilibriumError:
+        return False
     return True
 
 
@@ -377,6 +393,16 @@ def _closing_at_stop(walk: _Walk, near: Equilibrium) -> Held | LumenHeight | Jaw
     if isinstance(stop, TravelStop):
         return Held(walk.outer_radius - float(stop.travel))
     return JawForce(float(stop.force) / PARTS_OF_A_JAW, abs(near.force_slope) or 1.0)
+
+
+def _peak_memory_MB() -> float | None:
+    """Largest memory of this process so far, MB; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 def _result(walk: _Walk, failure: EquilibriumError | None) -> Result:
@@ -398,6 +424,6 @@ def _result(walk: _Walk, failure: EquilibriumError | None) -> Result:
         "compile_s": system.compile_seconds,
         "assembly_s": system.assembly_seconds - system.compile_seconds,
         "factor_s": system.solver.factor_seconds,
-        "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "peak_memory_MB": _peak_memory_MB(),
     }
     return Result(walk.model, states, failure, solver, cost)

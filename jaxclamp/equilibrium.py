@@ -37,6 +37,9 @@ LARGEST_MOVE = 0.25
 """a Newton correction moves no node further than this part of the lumen radius"""
 LARGEST_GROWTH = 1e2
 """a Newton step may leave a residual up to so many times the support reactions"""
+ROUND_OFF = 1e-11
+"""a correction below this part of the lumen radius is rounding: an unloaded, stress-free artery has
+no reactions to measure its residual by"""
 VOLUME_TOLERANCE = 1e-8
 """largest |mean J - 1 - p/bulk| of a converged cell"""
 
@@ -196,12 +199,13 @@ def residual_norm(lin: Linearisation) -> float:
 
 
 def _converged(system: System, lin: Linearisation, closing_error: float) -> bool:
-    scale = max(float(lin.reactions), 1e-12)
-    return (
-        residual_norm(lin) <= system.tolerance * scale
-        and float(lin.volume_error) <= VOLUME_TOLERANCE
-        and abs(closing_error) <= 1e-9 * system.length
-    )
+    small = residual_norm(lin) <= system.tolerance * max(float(lin.reactions), 1e-12)
+    return small and _closed(system, lin, closing_error)
+
+
+def _closed(system: System, lin: Linearisation, closing_error: float) -> bool:
+    """The cells have their volume, and the closing condition holds."""
+    return float(lin.volume_error) <= VOLUME_TOLERANCE and abs(closing_error) <= 1e-9 * system.length
 
 
 def _sound(lin: Linearisation) -> bool:
@@ -249,18 +253,19 @@ def newton(
             _factored(system, lin) if reuse is None else (reuse.negative_pivots, reuse.responses)
         )
         reuse = None
-        if _converged(system, lin, error):
+        dx, d_height = _bordered_step(responses, lin, closing, error)
+        rounding = float(np.max(np.abs(dx), initial=0.0)) <= ROUND_OFF * system.length
+        if _converged(system, lin, error) or (rounding and _closed(system, lin, error)):
             slope = -float(lin.jaw_stiffness) - float(np.dot(lin.jaw_coupling, responses[:, 1]))
             return Equilibrium(
                 state, pressure, step.axial_stretch, lin, negative, slope, responses, iteration
             )
-        dx, d_height = _bordered_step(responses, lin, closing, error)
         system.newton_iterations += 1
         state, lin, shortened = _admissible(system, state, lin, pressure, dx, d_height, MAX_CUTS - cuts)
         cuts += shortened
         norm = residual_norm(lin)
         first_norm = norm if iteration == 0 else first_norm
-        if iteration > 1 and norm > DIVERGING * first_norm:
+        if iteration > 2 and norm > DIVERGING * first_norm:
             raise NotConverged("Newton's residual grows", norm, float(lin.J_min))
     raise NotConverged(f"{MAX_NEWTON} Newton iterations", residual_norm(lin), float(lin.J_min))
 

@@ -87,15 +87,15 @@ def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) 
 def _into_place(staging: Path, folder: Path, written: list[Path]) -> list[Path]:
     """Rename the finished files into the folder and remove what an earlier result left over."""
     for path in written:
-        with path.open("rb") as file:  # a disk that fills up late says so here
+        with path.open("r+b") as file:  # a disk that fills up late says so here
             os.fsync(file.fileno())
     names = [path.relative_to(staging) for path in written]
     for parent in {(folder / name).parent for name in names}:
         parent.mkdir(exist_ok=True)
     for name in names:
         os.replace(staging / name, folder / name)
-    for pattern in (f"{STATES}/artery_*.vtu", f"{STATES}/jaws_*.vtu", f"{FIGURES}/*.png"):
-        for old in folder.glob(pattern):
+    for pattern in ("artery_[0-9][0-9][0-9].vtu", "jaws_[0-9][0-9][0-9].vtu"):
+        for old in (folder / STATES).glob(pattern):  # states of an earlier, longer result
             if old.relative_to(folder) not in names:
                 old.unlink()
     return [folder / name for name in names]

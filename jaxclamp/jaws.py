@@ -11,6 +11,7 @@ from __future__ import annotations
 import abc
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxclamp.pytree import quantity, record, static
@@ -102,13 +103,13 @@ class Spline(Jaw):
         """Distance between stations, mm."""
         return self.half_width / (jnp.shape(self.slopes)[0] + 0.5)
 
-    def height(self, z: Array) -> tuple[Array, Array]:
+    def height(self, z: Array | np.ndarray) -> tuple[Array, Array]:
         """h (mm) and h' at distances z (*batch) from the middle, z >= 0; straight past the end."""
         spacing = self._spacing()
         control = self._control()
         n = control.shape[0] - 1
         kinks = jnp.diff(jnp.append(jnp.diff(control), 0.0))  # of the polygon, at stations 1..n
-        t = z / spacing
+        t = jnp.asarray(z) / spacing
         u = t[None] - jnp.arange(1.0, n + 1.0).reshape(n, *[1] * t.ndim)
         kinks = kinks.reshape(u.shape[:1] + (1,) * t.ndim)
         # half_square(u, 1/2) is max(u, 0)**2 / 2 averaged over a station's width: a cubic B-spline

@@ -1,8 +1,8 @@
 """Sparse symmetric direct solvers behind one protocol: factor, solve, inertia.
 
 The pattern (upper triangle, compressed rows) is analysed once; values change. Every solve is
-checked against the matrix and refined once if needed; a back end that fails hands over to
-the next one, and SciPy's SuperLU is always there.
+checked against the matrix and refined if needed; a back end that does not load, cannot factor or
+solves wrongly hands over to the next one, and SciPy's SuperLU is always there.
 """
 
 from __future__ import annotations
@@ -46,8 +46,6 @@ class _Pardiso:
     def factor(self, values: np.ndarray) -> int | None:
         import pymklpardiso
 
-        if not np.all(np.isfinite(values)):
-            raise Singular("the tangent is not finite")
         try:
             if self._solver is None:
                 n = self._pattern.n
@@ -87,8 +85,6 @@ class _Rslab:
     def factor(self, values: np.ndarray) -> int | None:
         import rslab
 
-        if not np.all(np.isfinite(values)):
-            raise Singular("the tangent is not finite")
         try:
             if self._symbolic is None:
                 self._symbolic = rslab.analyze(self._lower(values), path="ldlt", ordering="metis", threads=2)
@@ -108,8 +104,6 @@ class _SuperLU:
         self._pattern = pattern
 
     def factor(self, values: np.ndarray) -> int | None:
-        if not np.all(np.isfinite(values)):
-            raise Singular("the tangent is not finite")
         try:
             self._factors = scipy.sparse.linalg.splu(
                 full_matrix(self._pattern, values).tocsc(),
@@ -152,16 +146,17 @@ class LinearSolver:
         names = available()
         if choice != "auto":
             names = [choice, *[n for n in names if n != choice]]
+        self._back_ends = {name: BACK_ENDS[name][0](pattern) for name in names}
         self._names = names
-        self._back_end: BackEnd = BACK_ENDS[names[0]][0](pattern)
+        self._name = names[0]
         self._values: np.ndarray = np.empty(0)
         self.factorisations = 0
         self.factor_seconds = 0.0
 
     @property
     def name(self) -> str:
-        """The back end in use."""
-        return self._names[0]
+        """The back end that factored last."""
+        return self._name
 
     def factor(self, values: np.ndarray) -> int | None:
         """Factor the matrix; returns its number of negative eigenvalues, None if unknown.
@@ -172,24 +167,40 @@ class LinearSolver:
         self.factorisations += 1
         self._values = values
         try:
-            return self._back_end.factor(values)
+            return self._factor_with(self._names)
         finally:
             self.factor_seconds += time.perf_counter() - start
+
+    def _factor_with(self, names: list[str]) -> int | None:
+        """Factor with the first of `names` that can; one that does not load is not asked again."""
+        if not np.all(np.isfinite(self._values)):
+            raise Singular("the tangent is not finite")
+        failure = Singular("no sparse solver is left")
+        for name in list(names):
+            try:
+                self._name = name
+                return self._back_ends[name].factor(self._values)
+            except Singular as error:
+                failure = error
+            except (ImportError, OSError) as error:
+                self._names = [other for other in self._names if other != name]
+                failure = Singular(f"{name} does not load: {error}")
+        raise failure
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         """Solve K x = b for b (n, n_rhs), checked. Raises Singular if it is not accurate."""
         while True:
-            x = self._back_end.solve(b)
+            back_end = self._back_ends[self._name]
+            x = back_end.solve(b)
             for _ in range(2):
                 error = b - self._times(x)
                 if np.all(np.linalg.norm(error, axis=0) <= RELATIVE_RESIDUAL * np.linalg.norm(b, axis=0)):
                     return x
-                x = x + self._back_end.solve(error)
-            if len(self._names) == 1 or not np.all(np.isfinite(self._values)):
+                x = x + back_end.solve(error)
+            after = self._names[self._names.index(self._name) + 1 :]
+            if not after:
                 raise Singular("the linear system could not be solved accurately")
-            self._names = self._names[1:]
-            self._back_end = BACK_ENDS[self._names[0]][0](self._pattern)
-            self._back_end.factor(self._values)
+            self._factor_with(after)
 
     def _times(self, x: np.ndarray) -> np.ndarray:
         n = self._pattern.n

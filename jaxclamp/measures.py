@@ -209,6 +209,7 @@ def _lumen_and_contact(body: Body, state: State, marks: Landmarks) -> Report:
         "jaw_height_mm": state.jaw_height,
         "lumen_height_mm": 2.0 * state.x[marks.lumen_top, 1],
         "lumen_width_mm": 2.0 * jnp.max(ring[:, 0]),
+        "lumen_overlap_mm": 2.0 * jnp.max(-state.x[body.topology.lumen_facets, 1]),
         "lumen_area_mm2": lumen_ring_area(ring, marks.element),
         "outer_radius_mm": state.x[marks.outer_top, 1],
         "max_contact_pressure_kPa": jnp.max(pressures),
@@ -231,13 +232,14 @@ def _balance(body: Body, state: State, pressure: Array, marks: Landmarks) -> Rep
     residual = (elastic - pressure * swelling).ravel()[body.topology.free]
     jaw_force = -jax.grad(contact_potential, argnums=2)(body, state.x, state.jaw_height)
     pushed = pressure * _lifting(body, state)
-    support = jnp.sum((elastic[:, 1] - pushed)[marks.fold_plane])
-    imbalance = jnp.abs(support + jnp.sum(pushed) - jaw_force)
+    supports = (elastic[:, 1] - pushed)[marks.fold_plane]
+    imbalance = jnp.abs(jnp.sum(supports) + jnp.sum(pushed) - jaw_force)
+    largest = jnp.max(jnp.stack([jnp.abs(jaw_force), jnp.sum(pushed), jnp.sum(jnp.abs(supports))]))
     return {
         "clamp_force_N": 1e-3 * PARTS_OF_A_JAW * jaw_force,
         "total_energy_uJ": PARTS * (energy - pressure * volume),
         "residual_mN": jnp.linalg.norm(residual),
-        "force_balance_error": imbalance / jnp.maximum(jnp.abs(jaw_force), jnp.sum(pushed) + 1e-12),
+        "force_balance_error": imbalance / (largest + 1e-6),
     }
 
 

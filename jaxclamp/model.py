@@ -44,7 +44,7 @@ def build_model(scene: Scene, like: Model | None = None) -> Model:
 
     like: a model whose integers are reused if the scene's static choices are the same.
     """
-    if like is not None and shape_of(scene)[0] == shape_of(like.scene)[0]:
+    if like is not None and same_kind(scene, like.scene):
         body = dataclasses.replace(
             like.body,
             geometry=build_geometry(like.mesh, scene.mesh, scene.artery),
@@ -62,6 +62,12 @@ def build_model(scene: Scene, like: Model | None = None) -> Model:
     body = jax.tree_util.tree_map(jnp.asarray, body)
     names = tuple(layer.name for layer in scene.artery.layers)
     return Model(scene, mesh, pattern, body, find_landmarks(mesh, names))
+
+
+def same_kind(a: Scene, b: Scene) -> bool:
+    """True if two scenes differ in floats, title and solver settings only."""
+    kinds = [shape_of(dataclasses.replace(s, title="", solver=a.solver), np.shape) for s in (a, b)]
+    return bool(kinds[0] == kinds[1])
 
 
 def _parameters(scene: Scene) -> Parameters:

@@ -18,6 +18,27 @@ if TYPE_CHECKING:
     from jaxclamp.plots import Picture
 
 
+FINAL_KEYS = (
+    "jaw_travel_mm",
+    "lumen_height_mm",
+    "lumen_width_mm",
+    "occlusion",
+    "lumen_area_mm2",
+    "area_occlusion",
+    "clamp_force_N",
+    "max_contact_pressure_kPa",
+    "max_penetration_mm",
+    "axial_stress_at_P_kPa",
+    "axial_stress_ratio_at_P",
+    "circumferential_stress_ratio_at_P",
+    "peak_axial_stress_kPa",
+    "peak_axial_stress_location_mm",
+    "smooth_peak_axial_stress_kPa",
+    "J_min",
+    "J_max",
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class Kept:
     """One converged state and what was read off it."""
@@ -76,8 +97,8 @@ class Result:
 
     @property
     def final(self) -> dict[str, Any]:
-        """The record of the last converged state; None everywhere if there is none with the jaws closing."""
-        return self.history[-1] if self.history else {}
+        """The record of the last converged state; None everywhere if it is not the artery in the body."""
+        return self.history[-1] if self.history else dict.fromkeys(FINAL_KEYS)
 
     def _relative(self, kept: Kept) -> dict[str, Any]:
         """A state's record, with the quantities that refer to the physiological state."""

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from jaxclamp import schema
+from jaxclamp.jaws import Spline
 from jaxclamp.pytree import UNIT_FACTOR
 from jaxclamp.scene import Layer, Scene, TravelStop
 from jaxclamp.schema import BadKey, refuse
@@ -35,7 +38,16 @@ SMOOTHINGS = (1e-6, 1.0)
 
 def check(scene: Scene) -> None:
     """Raise BadKey for the first thing that is impossible."""
-    for one in (check_names, check_proportions, check_closing, check_mesh, check_travel, check_solver):
+    checks = (
+        check_names,
+        check_proportions,
+        check_closing,
+        check_jaw,
+        check_mesh,
+        check_travel,
+        check_solver,
+    )
+    for one in checks:
         one(scene)
 
 
@@ -134,6 +146,20 @@ def check_travel(scene: Scene) -> None:
     """The jaws do not travel far beyond the artery."""
     if isinstance(scene.stop, TravelStop):
         _check_ratio("stop.travel_mm", scene.stop.travel, TRAVELS, _widest(scene))
+
+
+def check_jaw(scene: Scene) -> None:
+    """The middle of the jaw is its lowest point, as travel and first contact assume."""
+    jaw = scene.clamp.jaw
+    if isinstance(jaw, Spline):
+        height = np.asarray(jaw.height(np.linspace(0.0, float(jaw.half_width), 200))[0])
+        if np.min(height) < -1e-9 * float(jaw.half_width):
+            raise refuse(
+                "clamp.jaw.slopes",
+                np.asarray(jaw.slopes).tolist(),
+                "slopes that keep the middle the lowest point of the jaw; "
+                f"here it lies {-np.min(height):.3g} mm above the lowest",
+            )
 
 
 def check_solver(scene: Scene) -> None:

@@ -234,7 +234,7 @@ def _scene(table: dict[str, Any], fidelity: str) -> Scene:
         raise refuse(
             "stop.closed",
             table["stop"]["closed"],
-            "another stop: complete closure is not available yet; use occlusion = 0.95 or any value below 1",
+            "another stop: complete closure is not available yet; use an occlusion, such as 0.925",
         )
     mesh = table.get("mesh", {})
     if "artery" in table and isinstance(mesh, dict):

@@ -63,7 +63,7 @@ def tube_scene(
 def inflate(scene: Scene, like: Model | None = None) -> tuple[Model, Equilibrium, Equilibrium]:
     """Model, load-free and physiological state, without reading anything off them."""
     model = build_model(scene, like)
-    walk = _Walk(model, lambda event: None)
+    walk = _Walk(model, lambda event: None, 0.0)
     walk.keep = lambda *_: None  # type: ignore[method-assign]
     load_free = walk.load_free(None)
     return model, load_free, walk.physiological(load_free, None)

@@ -11,7 +11,7 @@ from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from jaxclamp.fields import LayerFields, layer_fields, layer_nodes
 from jaxclamp.plots.states import Clamped, final_state
-from jaxclamp.plots.style import INK, NORMAL, SMALL, Picture, dress, nice_limits, stress_colours
+from jaxclamp.plots.style import INK, NORMAL, SMALL, Picture, dress, nice_limits, plain, stress_colours
 
 FIELD = "axial_stress_kPa"
 FROM_INSIDE, FROM_OUTSIDE = (0.50, -0.75, 0.32), (0.50, 0.75, 0.32)
@@ -41,7 +41,7 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
             map_axes,
             "position along the artery (mm)" if last else "",
             "angle from the fold (deg)",
-            f"{layer.name}, highest through the layer",
+            f"{plain(layer.name)}, highest through the layer",
             grid=False,
         )
         _view(view_axes, layer, zoom, scale, inside=number == 0, mark_P=P)

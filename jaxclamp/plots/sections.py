@@ -10,7 +10,7 @@ from matplotlib.path import Path as Outline
 
 from jaxclamp.fields import jaw_height_shown, jaw_outline, layer_nodes
 from jaxclamp.plots.states import Clamped, shown_states
-from jaxclamp.plots.style import INK, JAW, JAW_EDGE, LARGE, SMALL, Picture, layer_colour
+from jaxclamp.plots.style import INK, JAW, JAW_EDGE, LARGE, SMALL, Picture, layer_colour, plain
 
 COLUMNS = 2
 WIDTH = 10.5
@@ -131,7 +131,7 @@ def _frame(axes: Axes, half_width: float, half_height: float) -> None:
 
 def _key(figure: Picture, result: Clamped, along: Axes, up: float, half_width: float) -> None:
     """Names of layers and jaws, and a scale."""
-    names = [layer.name for layer in result.scene.artery.layers]
+    names = [plain(layer.name) for layer in result.scene.artery.layers]
     handles = [
         Polygon([(0, 0)], facecolor=layer_colour(i)[0], edgecolor=layer_colour(i)[1], label=name)
         for i, name in enumerate(names)

@@ -91,3 +91,8 @@ def nice_limits(values: Sequence[np.ndarray], step: float) -> tuple[float, float
 def letters(count: int) -> list[str]:
     """A, B, C, ..."""
     return [chr(ord("A") + i) for i in range(count)]
+
+
+def plain(name: str) -> str:
+    """A user's name as text: no mathematics between dollar signs, and not hidden from legends."""
+    return name.replace("$", r"\$").lstrip("_") or "layer"

@@ -17,6 +17,7 @@ from jaxclamp.plots.style import (
     dress,
     layer_colour,
     legend,
+    plain,
 )
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def _through_wall(axes: Axes, layers: tuple[LayerFields, ...]) -> None:
         axes.text(
             0.5 * (radius[0] + radius[-1]),
             0.985,
-            layer.name,
+            plain(layer.name),
             transform=axes.get_xaxis_transform(),
             ha="center",
             va="top",
