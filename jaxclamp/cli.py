@@ -135,9 +135,10 @@ def show(
     fidelity: FidelityOption = None,
     overrides: SetOption = None,
     as_json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Check a scene and say what would be modelled; solves nothing."""
-    loaded = _load(scene, fidelity, overrides, quiet=False)
+    loaded = _load(scene, fidelity, overrides, quiet)
     from jaxclamp.model import describe
 
     described = describe(loaded)
@@ -163,7 +164,7 @@ def run(
     if folder is not None:
         _check_folder(folder)
     result, failure = _solve(loaded, quiet)
-    files = _write(result, folder) if result is not None and folder is not None else []
+    files = _write(result, folder, quiet) if result is not None and folder is not None else []
     if result is not None and as_json:
         typer.echo(console.as_json(result.to_dict()))
     elif result is not None and not quiet:
@@ -237,7 +238,8 @@ def _solve(scene: Scene, quiet: bool) -> tuple[Any, Exception | None]:
     return result, None if result.converged else result.failure
 
 
-def _write(result: Any, folder: Path) -> list[Path]:
+def _write(result: Any, folder: Path, quiet: bool) -> list[Path]:
     from jaxclamp.export import write_outputs
 
-    return list(write_outputs(result, folder))
+    with console.progress(quiet) as progress:
+        return list(write_outputs(result, folder, progress if callable(progress) else None))

@@ -76,7 +76,7 @@ class Engine:
             "warnings": [],
         }
 
-    def write_outputs(self, result, folder):
+    def write_outputs(self, result, folder, progress=None):
         if self.write_error is not None:
             raise self.write_error
         folder.mkdir(parents=True, exist_ok=True)

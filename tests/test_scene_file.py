@@ -340,7 +340,7 @@ def test_defaults_are_those_of_the_records():
 def test_a_stop_is_exactly_one():
     both = scene_table(FLAT, {"occlusion": 0.9, "force_N": 1.0})
     assert "expected exactly one of occlusion, travel_mm, force_N" in refusal(both)
-    assert "not available yet; use occlusion" in refusal(scene_table(FLAT, {"closed": True}))
+    assert "not available yet; use an occlusion" in refusal(scene_table(FLAT, {"closed": True}))
 
 
 def test_equal_jaws_are_one_and_different_ones_are_refused():
@@ -565,6 +565,14 @@ def test_scenes_that_do_not_exist_are_refused(name, words, tmp_path, monkeypatch
     assert str(caught.value).isprintable()
 
 
+@pytest.mark.parametrize("slopes", ["[-0.5, -0.5, -0.2, 0.5]", "[-1.0]", "[0.1, -1.0, 0.2]"])
+def test_a_jaw_whose_middle_is_not_its_lowest_point_is_refused(slopes):
+    """Travel and first contact are measured from the middle."""
+    jaw = f"clamp.jaw={{shape='spline', half_width_mm=2, slopes={slopes}, edge_radius_mm=1}}"
+    with pytest.raises(SceneError, match=r"clamp\.jaw\.slopes.*lowest point"):
+        load_scene("human-lad", [jaw])
+
+
 # ------------------------------------------------------------------------------------- round trip
 
 
@@ -594,7 +602,7 @@ jaws = st.one_of(
         {
             "shape": st.just("spline"),
             "half_width_mm": numbers(0.1, 30),
-            "slopes": st.lists(numbers(-5, 5), min_size=1, max_size=20),
+            "slopes": st.lists(numbers(0, 5), min_size=1, max_size=20),
             "edge_radius_mm": numbers(0.1, 10),
         }
     ),
