@@ -94,11 +94,19 @@ def _into_place(staging: Path, folder: Path, written: list[Path]) -> list[Path]:
         parent.mkdir(exist_ok=True)
     for name in names:
         os.replace(staging / name, folder / name)
-    for pattern in ("artery_[0-9][0-9][0-9].vtu", "jaws_[0-9][0-9][0-9].vtu"):
-        for old in (folder / STATES).glob(pattern):  # states of an earlier, longer result
-            if old.relative_to(folder) not in names:
-                old.unlink()
+    for old in _own_files(folder):  # of an earlier result with more states
+        if old.relative_to(folder) not in names:
+            old.unlink()
     return [folder / name for name in names]
+
+
+def _own_files(folder: Path) -> Iterator[Path]:
+    """The states and figures in a folder that bear names given here; a user's own files are others."""
+    from jaxclamp.plots import PLATES
+
+    for part in ("artery", "jaws"):
+        yield from (folder / STATES).glob(f"{part}_[0-9][0-9][0-9].vtu")
+    yield from (path for name, *_ in PLATES if (path := folder / FIGURES / f"{name}.png").exists())
 
 
 # --------------------------------------------------------------------------------- plain content

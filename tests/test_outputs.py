@@ -416,11 +416,13 @@ def test_a_full_disk_or_an_interruption_leaves_earlier_results_as_they_were(resu
 
 def test_an_earlier_result_with_more_states_is_replaced_as_a_whole(result, folder, tmp_path):
     export.write_outputs(result, tmp_path)
-    (tmp_path / "notes.txt").write_text("mine")
+    mine = {tmp_path / name for name in ("notes.txt", "figures/photo.png", "paraview/artery_mine.vtu")}
+    for path in mine:
+        path.write_text("mine")
     files = export.write_outputs(dataclasses.replace(result, states=result.states[:1]), tmp_path)
-    assert files_below(tmp_path) == {*files, tmp_path / "notes.txt"}
-    assert len(list(tmp_path.glob("paraview/*.vtu"))) == 2
-    assert len(list(tmp_path.glob("figures/*.png"))) == 1
+    assert files_below(tmp_path) == {*files, *mine}
+    assert len(list(tmp_path.glob("paraview/*.vtu"))) == 2 + 1
+    assert len(list(tmp_path.glob("figures/*.png"))) == 1 + 1
 
 
 def test_a_file_in_place_of_the_folder_is_refused(result, tmp_path):
