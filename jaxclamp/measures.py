@@ -187,7 +187,7 @@ def observe(body: Body, state: State, pressure: Array, marks: Landmarks) -> Repo
     """Every number reported of one equilibrium, keys as in result.json, JAX scalars.
 
     Lengths mm, stresses kPa, forces N, energies uJ. Several programs rather than one: they compile
-    in a third of the time.
+    faster.
     """
     s = stresses(body, state)
     return (

@@ -102,8 +102,8 @@ USUAL_ITERATIONS = 100
 START_SECONDS = 8.0
 """compilation and output, s"""
 ITERATION_SECONDS, ITERATION_EXPONENT = 2.1e-7, 1.47
-"""time of an iteration: factor times unknowns to the exponent, s (two meshes, two cores of 2024)"""
-START_MEMORY, MEMORY_PER_UNKNOWN = 500.0, 0.04
+"""time of an iteration: factor times unknowns to the exponent, s (fitted to two meshes)"""
+START_MEMORY, MEMORY_PER_UNKNOWN = 500.0, 0.025
 """MB: Python with the compiled programs, and what the factors add (the same two meshes)"""
 
 
