@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import sys
 import time
@@ -28,6 +29,7 @@ from jaxclamp.equilibrium import (
     newton,
     stretched,
 )
+from jaxclamp.inflation import inflated_positions, inflated_radius
 from jaxclamp.linear_solvers import LinearSolver
 from jaxclamp.measures import PARTS_OF_A_JAW, observe
 from jaxclamp.meshes import closed_positions
@@ -120,17 +122,27 @@ class _Walk:
             Progress("physiological", s, f"{e.pressure:.2f} kPa, axial stretch {e.axial_stretch:.3f}")
         )
         equilibrium = None
-        if guess is not None:
+        if guess is None:
+            guess = self.inflated(load_free)
+        else:
             guess = stretched(guess, stretch * self.model.half_length)
-            try:
+        if guess is not None:
+            with contextlib.suppress(NotConverged):
                 equilibrium = newton(self.system, guess, path(1.0))
-            except NotConverged:
-                equilibrium = None
-        if equilibrium is None:
+        if equilibrium is None or equilibrium.negative_pivots:
             equilibrium = self.walk("physiological", load_free, path, tell, lambda e: False, LOAD_STEP)
         self.system.length = float(equilibrium.state.x[self.model.marks.lumen_top, 1])
         self.keep("physiological", equilibrium, 1.0, f"lumen radius {self.system.length:.3f} mm")
         return equilibrium
+
+    def inflated(self, load_free: Equilibrium) -> State | None:
+        """The artery as an incompressible round tube at its stretch and pressure; None if there is none."""
+        artery, far = self.model.scene.artery, load_free.state.jaw_height
+        radius = inflated_radius(artery, self.system.length)
+        if radius is None:
+            return None
+        x = inflated_positions(load_free.state.x, artery, self.system.length, radius)
+        return with_equilibrium_pressure(self.model.body, x, far)
 
     def close(self, physiological: Equilibrium) -> Equilibrium:
         """Move the jaw on until the stop."""

@@ -97,11 +97,11 @@ def terms(scene: Scene) -> dict[str, str]:
     return found
 
 
-USUAL_ITERATIONS = 100
+USUAL_ITERATIONS = 90
 """Newton iterations of a whole clamping, on any mesh"""
 START_SECONDS = 8.0
 """compilation and output, s"""
-ITERATION_SECONDS, ITERATION_EXPONENT = 2.1e-7, 1.47
+ITERATION_SECONDS, ITERATION_EXPONENT = 8.2e-7, 1.33
 """time of an iteration: factor times unknowns to the exponent, s (fitted to two meshes)"""
 START_MEMORY, MEMORY_PER_UNKNOWN = 500.0, 0.025
 """MB: Python with the compiled programs, and what the factors add (the same two meshes)"""
@@ -123,7 +123,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "unknowns": unknowns,
         "stop": scene.stop.kind,
         "continuation": scene.solver.continuation,
-        "linear_solver": available()[0]
+        "linear_solver": available(unknowns)[0]
         if scene.solver.linear_solver == "auto"
         else scene.solver.linear_solver,
         "predicted_seconds": _rounded(

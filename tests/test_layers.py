@@ -21,6 +21,7 @@ LEVEL = {
     "meshes": 3,
     "scene_checks": 3,
     "energies": 4,
+    "inflation": 4,
     "scene_file": 4,
     "assembly": 5,
     "linear_solvers": 6,

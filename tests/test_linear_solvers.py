@@ -130,7 +130,7 @@ def test_a_back_end_that_cannot_factor_hands_over(monkeypatch):
 
 
 def test_without_optional_back_ends_superlu_works(monkeypatch):
-    monkeypatch.setattr(linear_solvers, "available", lambda: ["splu"])
+    monkeypatch.setattr(linear_solvers, "available", lambda unknowns: ["splu"])
     pattern, values, dense = indefinite(100, 0.2, 9)
     solver = LinearSolver(pattern)
     solver.factor(values)
@@ -157,3 +157,14 @@ def test_rslab_is_given_a_number_of_threads(monkeypatch):
     assert len(given) == 1
     assert type(given[0]) is int
     assert given[0] >= 1
+
+
+def test_threads_are_used_for_large_systems(monkeypatch):
+    """Only where there is a second core; the choice stays among what is installed."""
+    monkeypatch.setattr(linear_solvers, "cores", lambda: 2)
+    few, many = available(linear_solvers.MANY_UNKNOWNS - 1), available(linear_solvers.MANY_UNKNOWNS)
+    assert few == available()
+    assert sorted(many) == sorted(few)
+    assert many[0] == ("rslab" if "rslab" in few else few[0])
+    monkeypatch.setattr(linear_solvers, "cores", lambda: 1)
+    assert available(linear_solvers.MANY_UNKNOWNS) == few
