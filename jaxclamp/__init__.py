@@ -9,17 +9,58 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxclamp.clamping import Progress, Result, clamp  # noqa: E402
 from jaxclamp.equilibrium import EquilibriumError  # noqa: E402
+from jaxclamp.objectives import (  # noqa: E402
+    Measure,
+    axial_stress_at_P,
+    circumferential_stress_at_P,
+    clamp_force,
+    jaw_curvature,
+    jaw_half_width,
+    jaw_travel,
+    lumen_area,
+    lumen_height,
+    lumen_width,
+    mean_contact_pressure,
+    physiological_lumen_radius,
+    smooth_peak_axial_stress,
+    smooth_peak_circumferential_stress,
+    smooth_peak_contact_pressure,
+    smooth_peak_principal_stress,
+    stored_energy,
+    volume_above,
+)
 from jaxclamp.scene import Scene, replace  # noqa: E402
 from jaxclamp.scene_file import SceneError, dump_scene, load_scene  # noqa: E402
+from jaxclamp.sensitivity import evaluate, value_and_gradient  # noqa: E402
 
 __all__ = [
     "EquilibriumError",
+    "Measure",
     "Progress",
     "Result",
     "Scene",
     "SceneError",
+    "axial_stress_at_P",
+    "circumferential_stress_at_P",
     "clamp",
+    "clamp_force",
     "dump_scene",
+    "evaluate",
+    "jaw_curvature",
+    "jaw_half_width",
+    "jaw_travel",
     "load_scene",
+    "lumen_area",
+    "lumen_height",
+    "lumen_width",
+    "mean_contact_pressure",
+    "physiological_lumen_radius",
     "replace",
+    "smooth_peak_axial_stress",
+    "smooth_peak_circumferential_stress",
+    "smooth_peak_contact_pressure",
+    "smooth_peak_principal_stress",
+    "stored_energy",
+    "value_and_gradient",
+    "volume_above",
 ]

@@ -27,6 +27,7 @@ from jaxclamp.energies import (
     Stencils,
     contact_density,
     dilatation_density,
+    intima_density,
     jaw_gap,
     lumen_density,
     wall_density,
@@ -252,6 +253,10 @@ def _jaw(body: Body, jaw_height: Array) -> Density:
     return lambda y: contact_density(y, jaw_height, par.jaw, par.contact, body.geometry.dA)
 
 
+def _intima(body: Body, plane: Array | float = 0.0) -> Density:
+    return lambda y: intima_density(y, plane, body.parameters.contact, body.geometry.dA_inner)
+
+
 def _dilatation(stencils: Stencils, geometry: Geometry, dx_dxi: Array) -> Array:
     """int N_m (J - 1) dV of every cell, mm^3, (n_m, n_cells)."""
     density = dilatation_density(dx_dxi, geometry.to_local, geometry.dV)
@@ -265,6 +270,12 @@ def _condensed_pressure(geometry: Geometry, dilatation: Array) -> Array:
 
 def potential(body: Body, x: Array, jaw_height: Array, pressure: Array) -> Array:
     """Pi with the pressures at their best, uJ: a function of positions and loads alone."""
+    touch = contact_potential(body, x, jaw_height) + intima_potential(body, x, 0.0)
+    return stored_energy(body, x) - pressure * lumen_volume(body, x) + touch
+
+
+def stored_energy(body: Body, x: Array) -> Array:
+    """Strain energy of the wall of the modelled part, the pressures at their best, uJ."""
     x_cells = _gather(x, body.topology.cells)
     dx_dxi = at_points(body.stencils.wall, x_cells)
     dilatation = _dilatation(body.stencils, body.geometry, dx_dxi)
@@ -282,7 +293,7 @@ def potential(body: Body, x: Array, jaw_height: Array, pressure: Array) -> Array
         )
         for material, (first, last) in zip(body.parameters.materials, body.topology.layer_cells, strict=True)
     )
-    return wall + volumetric - pressure * lumen_volume(body, x) + contact_potential(body, x, jaw_height)
+    return wall + volumetric
 
 
 def lumen_volume(body: Body, x: Array) -> Array:
@@ -292,9 +303,15 @@ def lumen_volume(body: Body, x: Array) -> Array:
 
 
 def contact_potential(body: Body, x: Array, jaw_height: Array) -> Array:
-    """The contact energy of the modelled part, uJ."""
+    """The contact energy of the outer wall of the modelled part, uJ."""
     y = at_points(body.stencils.contact, _gather(x, body.topology.outer_facets))
     return jnp.sum(_jaw(body, jaw_height)(y))
+
+
+def intima_potential(body: Body, x: Array, plane: Array | float) -> Array:
+    """The contact energy of the inner wall of the modelled part against the plane y = `plane`, uJ."""
+    y = at_points(body.stencils.contact, _gather(x, body.topology.lumen_facets))
+    return jnp.sum(_intima(body, plane)(y))
 
 
 @record
@@ -329,15 +346,18 @@ def cut(body: Body, state: State) -> list[Piece]:
 
     A program of its own: slices inside the program that differentiates would keep it from being vectorised.
     """
-    g = replace(body.geometry, dA=jnp.zeros((0, body.geometry.dV.shape[-1])))
-    return [
-        Piece(
-            x=_gather(state.x, body.topology.cells[:, first:last]),
-            p=state.p[:, first:last],
-            geometry=jax.tree_util.tree_map(lambda a, i=first, j=last: a[..., i:j], g),
-        )
-        for _, first, last in body.topology.blocks
-    ]
+    return [piece(body, state, first, last) for _, first, last in body.topology.blocks]
+
+
+def piece(body: Body, state: State, first: int, last: int) -> Piece:
+    """The cells from `first` to before `last`."""
+    none = jnp.zeros((0, body.geometry.dV.shape[-1]))
+    g = replace(body.geometry, dA=none, dA_inner=none)
+    return Piece(
+        x=_gather(state.x, body.topology.cells[:, first:last]),
+        p=state.p[:, first:last],
+        geometry=jax.tree_util.tree_map(lambda a: a[..., first:last], g),
+    )
 
 
 @jax.jit
@@ -382,6 +402,57 @@ def linearise_block(piece: Piece, stencils: Stencils, material: Material) -> Blo
 
 
 @jax.jit
+def piece_force(piece: Piece, stencils: Stencils, material: Material) -> Array:
+    """d Psi/dx of the cells' nodes with the pressures at their best, mN, (n_en, 3, n_cells).
+
+    What `linearise_block` gives as force at equilibrium, without the tangent: cheap to differentiate.
+    """
+    g = piece.geometry
+    y = at_points(stencils.wall, piece.x)
+    keys = [(c, i) for c in range(3) for i in range(3)]
+    components = [y[key] for key in keys]
+    dilated = lambda v: dilatation_density(dict(zip(keys, v, strict=True)), g.to_local, g.dV)  # noqa: E731
+    pressures = _condensed_pressure(g, jnp.einsum("mq,qc->mc", stencils.modes, dilated(components)))
+    p = jnp.einsum("mq,mc->qc", stencils.modes, pressures)
+
+    def shape_energy(v: list[Array]) -> Array:
+        return jnp.sum(
+            wall_density(dict(zip(keys, v, strict=True)), g.to_local, g.dV, material, jnp.zeros(()))
+        )
+
+    volume = jax.vjp(dilated, components)[1](p)[0]
+    stress = [a + b for a, b in zip(jax.grad(shape_energy)(components), volume, strict=True)]
+    return to_nodes(stencils.wall, jnp.stack(stress).reshape(y.shape))
+
+
+def artery_forces(body: Body, x: Array, pressure: Array) -> Array:
+    """d Pi/dx of wall and blood without contact, mN, (n_nodes, 3); several programs, as in `linearise`."""
+    n_m = body.geometry.pressure_stiffness.shape[0]
+    state = State(x=x, p=jnp.zeros((n_m, body.topology.cells.shape[1])), jaw_height=jnp.zeros(()))
+    blocks = [
+        piece_force(cells, body.stencils, body.parameters.materials[layer])
+        for cells, (layer, _, _) in zip(cut(body, state), body.topology.blocks, strict=True)
+    ]
+    return _summed_forces(body, x, pressure, blocks)
+
+
+@jax.jit
+def _summed_forces(body: Body, x: Array, pressure: Array, blocks: list[Array]) -> Array:
+    force = -pressure * jax.grad(lumen_volume, argnums=1)(body, x)
+    for (_, first, last), block in zip(body.topology.blocks, blocks, strict=True):
+        force = force + _scatter(body.topology.cells[:, first:last], block, x.shape[0])
+    return force
+
+
+@jax.jit
+def contact_forces(body: Body, x: Array, jaw_height: Array) -> tuple[Array, Array]:
+    """d Pi/dx of all contact, mN, (n_nodes, 3), and d Pi/d jaw_height, mN."""
+    touch = lambda y, d: contact_potential(body, y, d) + intima_potential(body, y, 0.0)  # noqa: E731
+    slopes: tuple[Array, Array] = jax.grad(touch, argnums=(0, 1))(x, jaw_height)
+    return slopes
+
+
+@jax.jit
 def assemble(body: Body, state: State, pressure: Array, blocks: list[Block]) -> Linearisation:
     """Blood pressure, contact, and the blocks of the wall, summed into residual and tangent."""
     top, st = body.topology, body.stencils
@@ -389,14 +460,16 @@ def assemble(body: Body, state: State, pressure: Array, blocks: list[Block]) -> 
     lumen_e, lumen_f, lumen_k = cell_derivatives(
         _lumen(body, pressure), st.lumen, _gather(x, top.lumen_facets)
     )
+    meet_e, meet_f, meet_k = cell_derivatives(_intima(body), st.contact, _gather(x, top.lumen_facets))
     jaw_e, jaw_f, jaw_k = cell_derivatives(
         _jaw(body, state.jaw_height), st.contact, _gather(x, top.outer_facets)
     )
     # one scatter per block: XLA's is many times slower on a concatenation
     values = jnp.zeros(top.n_nonzeros + 1)
-    for slots, matrix in zip(top.slots, [*[b.matrix for b in blocks], lumen_k, jaw_k], strict=True):
+    for slots, matrix in zip(top.slots, [*[b.matrix for b in blocks], lumen_k + meet_k, jaw_k], strict=True):
         values = values.at[slots].add(matrix.ravel(), mode="promise_in_bounds")
-    force = _scatter(top.lumen_facets, lumen_f, n_nodes) + _scatter(top.outer_facets, jaw_f, n_nodes)
+    inner = _scatter(top.lumen_facets, lumen_f + meet_f, n_nodes)
+    force = inner + _scatter(top.outer_facets, jaw_f, n_nodes)
     for (_, first, last), block in zip(top.blocks, blocks, strict=True):
         force = force + _scatter(top.cells[:, first:last], block.force, n_nodes)
     force = force.ravel()
@@ -406,7 +479,7 @@ def assemble(body: Body, state: State, pressure: Array, blocks: list[Block]) -> 
         slope_of_height, (state.jaw_height,), (jnp.ones_like(state.jaw_height),)
     )
     return Linearisation(
-        energy=total(b.energy for b in blocks) + jnp.sum(lumen_e) + jnp.sum(jaw_e),
+        energy=total(b.energy for b in blocks) + jnp.sum(lumen_e) + jnp.sum(meet_e) + jnp.sum(jaw_e),
         residual=force[top.free],
         reactions=jnp.linalg.norm(force.at[top.free].set(0.0)),
         volume_error=jnp.max(jnp.stack([b.volume_error for b in blocks])),

@@ -27,6 +27,7 @@ from jaxclamp.equilibrium import (
     descend,
     follow,
     newton,
+    predict,
     stretched,
 )
 from jaxclamp.inflation import inflated_positions, inflated_radius
@@ -34,15 +35,15 @@ from jaxclamp.linear_solvers import LinearSolver
 from jaxclamp.measures import PARTS_OF_A_JAW, observe
 from jaxclamp.meshes import closed_positions
 from jaxclamp.model import Model, build_model, same_kind
-from jaxclamp.results import Kept, Result, work_balance
+from jaxclamp.results import Kept, LinearSolvers, Result, work_balance
 from jaxclamp.scene import ForceStop, OcclusionStop, Scene, TravelStop
 
 FIRST_TOUCH = 0.02
 """the first closing step, as part of the outer radius: enough to bring points into contact"""
 NEARLY_CLOSED = 0.99
 """a force stop is sought up to this occlusion"""
-LARGEST_OVERLAP = 1e-6
-"""opposite inner walls may overlap by this part of the lumen radius"""
+LARGEST_SINKING = 0.5
+"""jaw and wall, or opposite inner walls, may overlap by this part of the wall's thickness"""
 SMALLEST_SHARE = 1 / 16
 """a neighbour's solution is followed in steps of at least this share of the way, or given up"""
 RESCUE_MOVE = 0.02
@@ -64,13 +65,24 @@ class Progress:
 class _Walk:
     """One clamping under way: the system, what has converged so far, and whom to tell."""
 
-    def __init__(self, model: Model, report: Callable[[Progress], Any], start: float) -> None:
+    def __init__(
+        self,
+        model: Model,
+        report: Callable[[Progress], Any],
+        start: float,
+        solvers: LinearSolvers | None = None,
+    ) -> None:
         self.model, self.report, self.start = model, report, start
         self.states: list[Kept] = []
         settings = model.scene.solver
+        if solvers is None:
+            fresh = lambda: LinearSolver(model.pattern, settings.linear_solver)  # noqa: E731
+            solvers = LinearSolvers(stop=fresh(), physiological=fresh())
+        self.solvers = solvers
+        solvers.stop.reset_counts()
         self.system = System(
             body=model.body,
-            solver=LinearSolver(model.pattern, settings.linear_solver),
+            solver=solvers.stop,
             tolerance=settings.tolerance,
             length=1.0,
             diagonal=model.pattern.indptr[:-1],
@@ -88,10 +100,10 @@ class _Walk:
 
     def check(self, values: dict[str, Any]) -> None:
         """Refuse a closing state that the model does not cover. Raises EquilibriumError."""
-        reason = None
-        if values["lumen_overlap_mm"] > LARGEST_OVERLAP * self.lumen_radius:
-            reason = "the inner walls meet, and their contact is not modelled"
-        elif values["max_penetration_mm"] > 0.5 * (self.outer_radius - self.lumen_radius):
+        reason, thickness = None, self.outer_radius - self.lumen_radius
+        if values["lumen_overlap_mm"] > LARGEST_SINKING * thickness:
+            reason = "the inner walls sink into each other: raise contact.stiffness_kPa_per_mm"
+        elif values["max_penetration_mm"] > LARGEST_SINKING * thickness:
             reason = "the jaws sink into the wall: raise contact.stiffness_kPa_per_mm"
         if reason is not None:
             raise self.error("clamping", self.states[-1].equilibrium, NotConverged(reason))
@@ -341,55 +353,110 @@ def clamp(
 
     Raises EquilibriumError if the stop is not reached; its `result` keeps what did converge.
     """
+    return _clamp(scene, guess, progress, to_stop=True)
+
+
+def inflate(scene: Scene, *, guess: Result | None = None) -> Result:
+    """The artery of a scene in the body: load-free and physiological states, no clamp.
+
+    Raises EquilibriumError.
+    """
+    return _clamp(scene, guess, None, to_stop=False)
+
+
+def _clamp(
+    scene: Scene,
+    guess: Result | None,
+    progress: bool | Callable[[Progress], None] | None,
+    to_stop: bool,
+) -> Result:
     start = time.perf_counter()
     model = build_model(scene, None if guess is None else guess.model)
-    walk = _Walk(model, _reporter(progress), start)
     neighbour = guess is not None and guess.converged and same_kind(scene, guess.scene)
     warm = guess if neighbour else None
+    same_solver = warm is not None and warm.scene.solver == scene.solver
+    walk = _Walk(model, _reporter(progress), start, warm.linear_solvers if warm and same_solver else None)
     try:
-        if warm is not None and _warm(walk, warm):
+        if warm is not None and _warm(walk, warm, to_stop):
             return _result(walk, None)
         walk.states.clear()
-        walk.close(walk.physiological(walk.load_free(None), None))
+        physiological = walk.physiological(walk.load_free(None), None)
+        if to_stop:
+            walk.close(physiological)
     except EquilibriumError as error:
         error.result = _result(walk, error)
         raise
     return _result(walk, None)
 
 
-def _warm(walk: _Walk, guess: Result) -> bool:
+def _warm(walk: _Walk, guess: Result, to_stop: bool) -> bool:
     """Solve from a neighbour's states, over scenes in between if the way is long.
 
     False if that does not work and a cold start is needed.
     """
-    target = walk.model
-    load_free, base, last = (
-        kept.equilibrium for kept in (guess.load_free, guess.physiological, guess.states[-1]) if kept
-    )
+    target, first, last = walk.model, guess.physiological, guess.states[-1]
+    assert guess.load_free is not None
+    assert first is not None
+    if _same_artery(target.scene, guess.scene):
+        walk.states[:] = [guess.load_free, first]
+        walk.refer_to(first.equilibrium)
+        walk.system.length = walk.lumen_radius
+    else:
+        try:
+            load_free = walk.load_free(guess.load_free.state)
+            walk.refer_to(walk.physiological(load_free, first.state))
+        except EquilibriumError:
+            return False
+    if not to_stop:
+        return True
+    if last.stage != "clamping":
+        walk.close(walk.states[-1].equilibrium)
+        return True
+    found = _warm_stop(walk, guess, last.equilibrium)
+    try:
+        if found is not None:
+            walk.keep("clamping", found, 1.0, "from a neighbouring solution")
+    except EquilibriumError:
+        return False
+    return found is not None
+
+
+def _same_artery(a: Scene, b: Scene) -> bool:
+    """True if the states without the clamp are the same, to no less accuracy than b's."""
+    pairs = zip(*map(jax.tree_util.tree_leaves, ((a.artery, a.mesh), (b.artery, b.mesh))), strict=True)
+    equal = all(np.array_equal(u, v) for u, v in pairs)
+    return equal and b.solver.tolerance <= a.solver.tolerance
+
+
+def _warm_stop(walk: _Walk, guess: Result, last: Equilibrium) -> Equilibrium | None:
+    """The state at the stop, followed from a neighbour's with as few scenes in between as it takes."""
+    target, base = walk.model, walk.states[-1].equilibrium
+    radii = walk.lumen_radius, walk.outer_radius
+    old = guess.physiological
+    assert old is not None
+    old_radii = [float(old.state.x[n, 1]) for n in (target.marks.lumen_top, target.marks.outer_top)]
     reached, step = 0.0, 1.0
     while reached < 1.0:
         t = min(1.0, reached + step)
         walk.use(target if t == 1.0 else build_model(between(guess.scene, target.scene, t), target))
-        walk.states.clear()
+        walk.lumen_radius, walk.outer_radius = (
+            u + t * (v - u) for u, v in zip(old_radii, radii, strict=True)
+        )
+        closing = _closing_at_stop(walk, last)
+        scene = walk.model.scene
+        half_length = walk.model.half_length * float(scene.artery.axial_stretch)
+        near = dataclasses.replace(last, state=stretched(last.state, half_length))
         try:
-            new_load_free = walk.load_free(load_free.state) if t == 1.0 else load_free
-            new_base = walk.physiological(new_load_free, base.state)
-            walk.refer_to(new_base)
-            closing = _closing_at_stop(walk, last)
-            start = stretched(last.state, new_base.axial_stretch * walk.model.half_length)
-            found = newton(walk.system, start, walk.step(closing))
-        except (NotConverged, EquilibriumError):
+            start = predict(walk.system, near, walk.step(closing))
+            last = newton(walk.system, start, walk.step(closing))
+            reached = t
+        except NotConverged:
             step = 0.5 * step
             if step < SMALLEST_SHARE:
-                walk.use(target)
-                return False
-            continue
-        reached, load_free, base, last = t, new_load_free, new_base, found
-    try:
-        walk.keep("clamping", last, 1.0, "from a neighbouring solution")
-    except EquilibriumError:
-        return False
-    return True
+                break
+    walk.use(target)
+    walk.refer_to(base)
+    return last if reached == 1.0 else None
 
 
 def between(a: Scene, b: Scene, t: float) -> Scene:
@@ -438,4 +505,4 @@ def _result(walk: _Walk, failure: EquilibriumError | None) -> Result:
         "factor_s": system.solver.factor_seconds,
         "peak_memory_MB": _peak_memory_MB(),
     }
-    return Result(walk.model, states, failure, solver, cost)
+    return Result(walk.model, states, failure, solver, cost, walk.solvers)

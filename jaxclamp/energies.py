@@ -4,6 +4,7 @@ The potential of the modelled eighth is
 
     Pi(x, p; d) = sum_cells int [psi_bar(F) + p (J - 1)] dV - 1/2 p' M p     (wall)
                   - pressure * V_lumen(x) + int phi(gap(x; d)) dA            (blood, jaws)
+                  + int phi(y + smoothing) dA                 (opposite inner walls)
 
 with one or four pressures p per cell and M = int N_m N_n / bulk dV, so that at equilibrium
 p = bulk (J - 1) averaged over the cell (mean dilatation, Q1/P0) or projected on the linear
@@ -62,6 +63,8 @@ class Geometry:
     """stress-free volume of a point, mm^3, (n_q, n_cells)"""
     dA: Array
     """stress-free outer area of a contact point, mm^2, (n_cq, n_facets)"""
+    dA_inner: Array
+    """stress-free area of a contact point of the lumen's surface, mm^2, (n_cq, n_facets)"""
     pressure_stiffness: Array
     """inverse of M, kPa/mm^3, (n_m, n_m, n_cells)"""
 
@@ -102,15 +105,19 @@ def build_geometry(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Geomet
 
     facet_points, facet_weights = tensor_rule((settings.contact_points,) * 2)
     _, dN_facet = lagrange(element.nodes_1d, facet_points)
-    outer_layer = X[:, :, mesh.layer_cells[-1][0] :]
-    n_radial = settings.radial[-1]
-    outer_face = element.node_grid[:, 0] == element.order
-    X_facet = outer_layer[:, outer_face, n_radial - 1 :: n_radial]
-    tangents = jnp.einsum("qka,iac->kiqc", dN_facet, X_facet)
+    outer_face, inner_face = (element.node_grid[:, 0] == side for side in (element.order, 0))
+    last = mesh.layer_cells[-1][0] + settings.radial[-1] - 1
+    first_layer_end = mesh.layer_cells[0][1]
+
+    def area(X_facet: Array) -> Array:
+        tangents = jnp.einsum("qka,iac->kiqc", dN_facet, X_facet)
+        return norm(cross(tangents[0], tangents[1])) * facet_weights[:, None]
+
     return Geometry(
         to_local=stacked(product(inverse(jacobian), axes)),
         dV=dV,
-        dA=norm(cross(tangents[0], tangents[1])) * facet_weights[:, None],
+        dA=area(X[:, outer_face, last :: settings.radial[-1]]),
+        dA_inner=area(X[:, inner_face, : first_layer_end : settings.radial[0]]),
         pressure_stiffness=jnp.moveaxis(jnp.linalg.inv(M), 0, -1),
     )
 
@@ -153,6 +160,16 @@ def contact_density(y: Tensor, jaw_height: Array, jaw: Jaw, contact: Contact, dA
     y: current position, [0, component], each (n_q, n_facets); jaw_height: mm
     """
     return contact.energy(jaw_gap([y[0, i] for i in range(3)], jaw_height, jaw)) * dA
+
+
+def intima_density(y: Tensor, plane: Array | float, contact: Contact, dA: Array) -> Array:
+    """Contact energy of the lumen's surface against its mirror image, uJ.
+
+    By symmetry the opposite walls meet in a plane (y = 0). The law of the jaws' contact, shifted so
+    that it sets in where the wall crosses the plane: beside the fold the open wall comes arbitrarily
+    close to it.
+    """
+    return contact.energy(y[0, 1] - plane + contact.smoothing) * dA
 
 
 def jaw_gap(x: Vector, jaw_height: Array, jaw: Jaw) -> Array:

@@ -270,6 +270,28 @@ def newton(
     raise NotConverged(f"{MAX_NEWTON} Newton iterations", residual_norm(lin), float(lin.J_min))
 
 
+def predict(system: System, near: Equilibrium, step: Step) -> State:
+    """First-order prediction of a neighbouring equilibrium with the factors of a near one.
+
+    One Newton correction of equilibrium and closing condition with the tangent of `near`, which the
+    solver still holds: the change of the state with the scene times the change of the scene. Without
+    those factors, or where the prediction is no sound state, it is the state of `near`.
+    """
+    if not system.solver.holds(np.asarray(near.lin.values)):
+        return near.state
+    lin = system.linearise(near.state, step.pressure)
+    if not _sound(lin):
+        return near.state
+    both = np.stack([-np.asarray(lin.residual), -np.asarray(lin.jaw_coupling)], axis=1)
+    try:
+        responses = system.solver.solve(both)
+        dx, d_height = _bordered_step(responses, lin, step.closing, step.closing.error(near.state, lin))
+    except (Singular, NotConverged):
+        return near.state
+    largest = max(float(np.max(np.abs(dx))), abs(d_height), 1e-300)
+    return advance(system.body, near.state, dx, d_height, min(1.0, LARGEST_MOVE * system.length / largest))
+
+
 def _factored(system: System, lin: Linearisation) -> tuple[int | None, np.ndarray]:
     """Negative eigenvalues of the tangent, and both responses (n_free, 2). Raises NotConverged."""
     try:

@@ -32,8 +32,12 @@ class Jaw(abc.ABC):
         """Distance along the artery from the jaw's middle to its side, mm."""
 
     @abc.abstractmethod
+    def curvatures(self) -> Array:
+        """Greatest curvatures of the parts of the face, 1/mm, convex ones positive, (n_parts,)."""
+
     def least_radius(self) -> Array:
         """Least radius of curvature of the convex parts of the face, mm (an estimate for meshing)."""
+        return 1.0 / jnp.maximum(jnp.max(self.curvatures()), 1e-12)
 
 
 @record
@@ -50,8 +54,8 @@ class Cylinder(Jaw):
     def half_extent(self) -> Array:
         return jnp.asarray(self.radius)
 
-    def least_radius(self) -> Array:
-        return jnp.asarray(self.radius)
+    def curvatures(self) -> Array:
+        return jnp.reshape(1.0 / self.radius, 1)
 
 
 @record
@@ -70,8 +74,8 @@ class Flat(Jaw):
     def half_extent(self) -> Array:
         return jnp.asarray(self.half_width + self.edge_radius)
 
-    def least_radius(self) -> Array:
-        return jnp.asarray(self.edge_radius)
+    def curvatures(self) -> Array:
+        return jnp.reshape(1.0 / self.edge_radius, 1)
 
 
 @record
@@ -129,9 +133,9 @@ class Spline(Jaw):
     def half_extent(self) -> Array:
         return jnp.asarray(self.half_width + self.edge_radius)
 
-    def least_radius(self) -> Array:
-        curvature = jnp.maximum(jnp.max(jnp.diff(self._control())), 0.0) / self._spacing()
-        return 1.0 / jnp.maximum(curvature, 1.0 / self.edge_radius)
+    def curvatures(self) -> Array:
+        bends = jnp.diff(self._control()) / self._spacing()
+        return jnp.append(bends, 1.0 / self.edge_radius)
 
 
 def _rounded(past_end: Array, above: Array, half_width: Array, radius: Array) -> Array:

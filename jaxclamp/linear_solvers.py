@@ -168,6 +168,15 @@ class LinearSolver:
         self._names = names
         self._name = names[0]
         self._values: np.ndarray = np.empty(0)
+        self._choice = choice
+        self.reset_counts()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """In another process, a solver without factors."""
+        return LinearSolver, (self._pattern, self._choice)
+
+    def reset_counts(self) -> None:
+        """Count and time from here."""
         self.factorisations = 0
         self.factor_seconds = 0.0
 
@@ -219,6 +228,16 @@ class LinearSolver:
             if not after:
                 raise Singular("the linear system could not be solved accurately")
             self._factor_with(after)
+
+    def solve_for(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Solve with the matrix `values`, which is factored unless it was factored last."""
+        if not self.holds(values):
+            self.factor(values)
+        return self.solve(b)
+
+    def holds(self, values: np.ndarray) -> bool:
+        """True if this very array was factored last."""
+        return self._values is values
 
     def _times(self, x: np.ndarray) -> np.ndarray:
         n = self._pattern.n

@@ -18,18 +18,26 @@ import numpy as np
 from jax import Array
 
 from jaxclamp.assembly import (
+    AnyArray,
     Body,
+    Piece,
     State,
     at_points,
     contact_potential,
+    cut,
     gaps,
+    intima_potential,
     lumen_volume,
+    piece,
     potential,
 )
 from jaxclamp.elements import Element, gauss, lagrange, tensor_rule
+from jaxclamp.energies import Stencils
+from jaxclamp.materials import Material
 from jaxclamp.meshes import Mesh
 from jaxclamp.pytree import record, static
 from jaxclamp.tensors import (
+    Tensor,
     cross,
     det,
     largest_eigenvalue,
@@ -80,9 +88,14 @@ def tensor_nodes(element: Element) -> np.ndarray:
     return element.nodes_1d[element.node_grid]
 
 
+def layer_of_P(layer_names: tuple[str, ...]) -> int:
+    """The innermost layer called "media", or the innermost."""
+    return layer_names.index("media") if "media" in layer_names else 0
+
+
 def find_landmarks(mesh: Mesh, layer_names: tuple[str, ...]) -> Landmarks:
     """The nodes and cells of interest; P is on the innermost layer called "media", or the innermost."""
-    layer = layer_names.index("media") if "media" in layer_names else 0
+    layer = layer_of_P(layer_names)
     P = mesh.node(mesh.layer_inner_line(layer), -1, 0)
     first, last = mesh.layer_cells[layer]
     corner, cell = np.argwhere(mesh.cells[:, first:last] == P)[0]
@@ -98,29 +111,21 @@ def find_landmarks(mesh: Mesh, layer_names: tuple[str, ...]) -> Landmarks:
     )
 
 
-def deformation(body: Body, x: Array) -> dict[tuple[int, int], Array]:
-    """Deformation gradient by components, columns along the material axes, each (n_q, n_cells)."""
-    dx_dxi = at_points(body.stencils.wall, jnp.swapaxes(x[body.topology.cells], 1, 2))
-    return product(transpose(dx_dxi), body.geometry.to_local)
-
-
-@jax.jit
-def cauchy_stress(body: Body, state: State) -> tuple[dict[tuple[int, int], Array], Array]:
-    """Deformation gradient, and Cauchy stress (3, 3, n_q, n_cells) in kPa, Eqs. (7) to (9).
+def cauchy_stress(
+    piece: Piece, modes: AnyArray, gradients: AnyArray, material: Material
+) -> tuple[Tensor, Array]:
+    """Deformation gradient by components, and Cauchy stress (3, 3, n_q, n_cells) in kPa, Eqs. (7) to (9).
 
     sigma = p I + (1/J) d psi_bar/dF F', with the pressure of the cell.
+    modes: (n_m, n_q); gradients: dN/dxi, (n_q, 3, n_en); F has its columns along the material axes
     """
-    F = deformation(body, state.x)
-    parts = []
-    for material, (start, stop) in zip(body.parameters.materials, body.topology.layer_cells, strict=True):
-        local = {key: value[:, start:stop] for key, value in F.items()}
-        P = jax.grad(lambda G, m=material: jnp.sum(m.psi_bar(G)))(local)
-        parts.append(stacked(product(P, transpose(local))) / det(local))
-    p = jnp.einsum("mq,mc->qc", body.stencils.modes, state.p)
-    return F, jnp.concatenate(parts, axis=-1) + p * jnp.eye(3)[:, :, None, None]
+    F = product(transpose(at_points(gradients, piece.x)), piece.geometry.to_local)
+    P = jax.grad(lambda G: jnp.sum(material.psi_bar(G)))(F)
+    p = jnp.einsum("mq,mc->qc", modes, piece.p)
+    return F, stacked(product(P, transpose(F))) / det(F) + p * jnp.eye(3)[:, :, None, None]
 
 
-def along(F: dict[tuple[int, int], Array], sigma: Array, axis: int) -> Array:
+def along(F: Tensor, sigma: Array, axis: int) -> Array:
     """Normal stress along the deformed image of a material axis (0 radial, 1 circumferential), kPa."""
     t = [F[i, axis] for i in range(3)]
     squared_length = total(component * component for component in t)
@@ -141,13 +146,9 @@ class Stresses:
     """volume ratio"""
 
 
-def stresses(body: Body, state: State) -> Stresses:
-    """Stress components of interest at every quadrature point."""
-    return _components(*cauchy_stress(body, state))
-
-
-@jax.jit
-def _components(F: dict[tuple[int, int], Array], sigma: Array) -> Stresses:
+def piece_stresses(piece: Piece, stencils: Stencils, material: Material) -> Stresses:
+    """Stress components of interest at the quadrature points of some cells of one layer."""
+    F, sigma = cauchy_stress(piece, stencils.modes, stencils.wall, material)
     return Stresses(
         circumferential=along(F, sigma, 1),
         axial=sigma[2, 2],
@@ -155,6 +156,25 @@ def _components(F: dict[tuple[int, int], Array], sigma: Array) -> Stresses:
         greatest=largest_eigenvalue(sigma),
         J=det(F),
     )
+
+
+_piece_stresses = jax.jit(piece_stresses)
+
+
+def stresses(body: Body, state: State) -> Stresses:
+    """Stress components of interest at every quadrature point."""
+    materials = body.parameters.materials
+    parts = [
+        _piece_stresses(cells, body.stencils, materials[layer])
+        for cells, (layer, _, _) in zip(cut(body, state), body.topology.blocks, strict=True)
+    ]
+    return jax.tree_util.tree_map(lambda *arrays: jnp.concatenate(arrays, axis=-1), *parts)
+
+
+def layer_stresses(body: Body, state: State, layer: int) -> Stresses:
+    """The same for one layer."""
+    cells = piece(body, state, *body.topology.layer_cells[layer])
+    return piece_stresses(cells, body.stencils, body.parameters.materials[layer])
 
 
 def lumen_ring_area(ring: Array, element: Element) -> Array:
@@ -180,6 +200,21 @@ def contact_pressure(body: Body, state: State, element: Element) -> tuple[Array,
     return pressure * body.geometry.dA / da, da
 
 
+def mean_contact_pressure(body: Body, state: State, element: Element) -> tuple[Array, Array]:
+    """Contact force over contact area, kPa (0 without contact), and that area in the model, mm^2.
+
+    A point counts as in contact where it presses with more than stiffness times smoothing, in part
+    where it presses less, smoothly.
+    """
+    pressure, da = contact_pressure(body, state, element)
+    contact = body.parameters.contact
+    onset = contact.stiffness * contact.smoothing
+    share = jnp.clip(pressure * da / body.geometry.dA / onset, 0.0, 1.0)
+    area = jnp.sum(da * share**2 * (3.0 - 2.0 * share))
+    mean = jnp.sum(pressure * da) / jnp.where(area > 0.0, area, 1.0)
+    return jnp.where(area > 0.0, mean, 0.0), area
+
+
 Report = dict[str, Any]
 
 
@@ -201,10 +236,8 @@ def observe(body: Body, state: State, pressure: Array, marks: Landmarks) -> Repo
 def _lumen_and_contact(body: Body, state: State, marks: Landmarks) -> Report:
     """Lumen, outer wall and contact."""
     ring = state.x[marks.lumen_ring, :2]
-    pressures, areas = contact_pressure(body, state, marks.element)
-    loaded_area = jnp.sum(jnp.where(pressures > 0.0, areas, 0.0))
-    touching = loaded_area > 0.0
-    mean = jnp.sum(pressures * areas) / jnp.where(touching, loaded_area, 1.0)
+    pressures, _ = contact_pressure(body, state, marks.element)
+    mean, area = mean_contact_pressure(body, state, marks.element)
     return {
         "jaw_height_mm": state.jaw_height,
         "lumen_height_mm": 2.0 * state.x[marks.lumen_top, 1],
@@ -213,8 +246,8 @@ def _lumen_and_contact(body: Body, state: State, marks: Landmarks) -> Report:
         "lumen_area_mm2": lumen_ring_area(ring, marks.element),
         "outer_radius_mm": state.x[marks.outer_top, 1],
         "max_contact_pressure_kPa": jnp.max(pressures),
-        "mean_contact_pressure_kPa": jnp.where(touching, mean, 0.0),
-        "contact_area_mm2": PARTS_OF_A_JAW * loaded_area,
+        "mean_contact_pressure_kPa": mean,
+        "contact_area_mm2": PARTS_OF_A_JAW * area,
         "max_penetration_mm": jnp.maximum(jnp.max(-gaps(body, state)), 0.0),
     }
 
@@ -224,19 +257,21 @@ def _balance(body: Body, state: State, pressure: Array, marks: Landmarks) -> Rep
     """Energy, jaw force, and the checks of equilibrium.
 
     Residual and balance come from the gradient of the potential, not from the assembled system
-    that was solved. The balance is that of the modelled part along y: the cut through the wall and
-    the pressure on the lumen's projection against the force on the jaw.
+    that was solved. The balance is that of the modelled part along y: the cut through the wall, the
+    pressure on the lumen's projection and the contact of the inner walls against the force on the jaw.
     """
     energy, elastic = jax.value_and_grad(potential, argnums=1)(body, state.x, state.jaw_height, 0.0)
     volume, swelling = jax.value_and_grad(lumen_volume, argnums=1)(body, state.x)
     residual = (elastic - pressure * swelling).ravel()[body.topology.free]
     jaw_force = -jax.grad(contact_potential, argnums=2)(body, state.x, state.jaw_height)
+    between_walls = jax.grad(intima_potential, argnums=2)(body, state.x, 0.0)
     pushed = pressure * _lifting(body, state)
     supports = (elastic[:, 1] - pushed)[marks.fold_plane]
-    imbalance = jnp.abs(jnp.sum(supports) + jnp.sum(pushed) - jaw_force)
+    imbalance = jnp.abs(jnp.sum(supports) + jnp.sum(pushed) + between_walls - jaw_force)
     largest = jnp.max(jnp.stack([jnp.abs(jaw_force), jnp.sum(pushed), jnp.sum(jnp.abs(supports))]))
     return {
         "clamp_force_N": 1e-3 * PARTS_OF_A_JAW * jaw_force,
+        "lumen_contact_force_N": 1e-3 * PARTS_OF_A_JAW * between_walls,
         "total_energy_uJ": PARTS * (energy - pressure * volume),
         "residual_mN": jnp.linalg.norm(residual),
         "force_balance_error": imbalance / (largest + 1e-6),

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxclamp.assembly import Body, Pattern, build_topology, supported
-from jaxclamp.energies import Parameters, build_geometry, build_stencils
+from jaxclamp.assembly import Body, Pattern, Topology, build_topology, supported
+from jaxclamp.energies import Parameters, Stencils, build_geometry, build_stencils
 from jaxclamp.linear_solvers import available
 from jaxclamp.measures import Landmarks, find_landmarks
 from jaxclamp.meshes import Mesh, axial_fractions, build_mesh
-from jaxclamp.pytree import shape_of
+from jaxclamp.pytree import record, shape_of
 from jaxclamp.scene import Scene
 
 SYMMETRY = (
@@ -23,15 +23,32 @@ SYMMETRY = (
 )
 
 
+@record
+class Discretisation:
+    """What a scene's static choices alone decide: integers and fixed fractions, no physics."""
+
+    mesh: Mesh
+    topology: Topology
+    stencils: Stencils
+    marks: Landmarks
+
+
 @dataclasses.dataclass(frozen=True)
 class Model:
     """A scene made ready to compute with."""
 
     scene: Scene
-    mesh: Mesh
+    discretisation: Discretisation
     pattern: Pattern
     body: Body
-    marks: Landmarks
+
+    @property
+    def mesh(self) -> Mesh:
+        return self.discretisation.mesh
+
+    @property
+    def marks(self) -> Landmarks:
+        return self.discretisation.marks
 
     @property
     def half_length(self) -> float:
@@ -39,44 +56,47 @@ class Model:
         return 0.5 * float(self.scene.artery.length)
 
 
-def build_model(scene: Scene, like: Model | None = None) -> Model:
-    """Mesh, sparse pattern and stress-free geometry of a scene.
-
-    like: a model whose integers are reused if the scene's static choices are the same.
-    """
-    if like is not None and same_kind(scene, like.scene):
-        body = dataclasses.replace(
-            like.body,
-            geometry=build_geometry(like.mesh, scene.mesh, scene.artery),
-            parameters=_parameters(scene),
-        )
-        return dataclasses.replace(like, scene=scene, body=body)
+def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
+    """Mesh, sparse pattern and landmarks of a scene's static choices."""
     mesh = build_mesh(scene.mesh)
     topology, pattern = build_topology(mesh)
-    body = Body(
-        topology=topology,
-        stencils=build_stencils(mesh, scene.mesh),
-        geometry=build_geometry(mesh, scene.mesh, scene.artery),
-        parameters=_parameters(scene),
+    marks = find_landmarks(mesh, tuple(layer.name for layer in scene.artery.layers))
+    stencils = build_stencils(mesh, scene.mesh)
+    topology, stencils = jax.tree_util.tree_map(jnp.asarray, (topology, stencils))
+    return Discretisation(mesh=mesh, topology=topology, stencils=stencils, marks=marks), pattern
+
+
+def body_of(scene: Scene, discretisation: Discretisation) -> Body:
+    """The body of a scene; a JAX function of every float in it."""
+    parameters = Parameters(
+        materials=tuple(layer.material for layer in scene.artery.layers),
+        contact=scene.contact,
+        jaw=scene.clamp.jaw,
     )
-    body = jax.tree_util.tree_map(jnp.asarray, body)
-    names = tuple(layer.name for layer in scene.artery.layers)
-    return Model(scene, mesh, pattern, body, find_landmarks(mesh, names))
+    return Body(
+        topology=discretisation.topology,
+        stencils=discretisation.stencils,
+        geometry=build_geometry(discretisation.mesh, scene.mesh, scene.artery),
+        parameters=jax.tree_util.tree_map(jnp.asarray, parameters),
+    )
+
+
+def build_model(scene: Scene, like: Model | None = None) -> Model:
+    """A scene made ready to compute with.
+
+    like: a model whose discretisation is reused if the scene's static choices are the same.
+    """
+    if like is not None and same_kind(scene, like.scene):
+        discretisation, pattern = like.discretisation, like.pattern
+    else:
+        discretisation, pattern = discretise(scene)
+    return Model(scene, discretisation, pattern, body_of(scene, discretisation))
 
 
 def same_kind(a: Scene, b: Scene) -> bool:
     """True if two scenes differ in floats, title and solver settings only."""
     kinds = [shape_of(dataclasses.replace(s, title="", solver=a.solver), np.shape) for s in (a, b)]
     return bool(kinds[0] == kinds[1])
-
-
-def _parameters(scene: Scene) -> Parameters:
-    parameters = Parameters(
-        materials=tuple(layer.material for layer in scene.artery.layers),
-        contact=scene.contact,
-        jaw=scene.clamp.jaw,
-    )
-    return jax.tree_util.tree_map(jnp.asarray, parameters)
 
 
 def terms(scene: Scene) -> dict[str, str]:
@@ -93,6 +113,7 @@ def terms(scene: Scene) -> dict[str, str]:
     )
     if float(scene.artery.pressure) != 0.0:
         found["blood pressure"] = "follower load on the lumen, as enclosed volume"
+    found["lumen contact"] = "opposite inner walls meet in the plane of symmetry once the lumen closes"
     found["jaw contact"] = f"rigid '{scene.clamp.jaw.shape}' jaw against the outer wall, frictionless"
     return found
 

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from jaxclamp.assembly import State
 from jaxclamp.equilibrium import Equilibrium, EquilibriumError
+from jaxclamp.linear_solvers import LinearSolver
 from jaxclamp.measures import PEAK_SHARPNESS
 from jaxclamp.model import SYMMETRY, Model, terms
+from jaxclamp.objectives import Measure, Seen
 from jaxclamp.scene import Scene
 
 if TYPE_CHECKING:
@@ -55,6 +57,15 @@ class Kept:
 
 
 @dataclasses.dataclass(frozen=True)
+class LinearSolvers:
+    """Solvers that hold the factors of a clamping: those of the last state, and room for the first's."""
+
+    stop: LinearSolver
+    physiological: LinearSolver
+    """unused until a derivative asks for it"""
+
+
+@dataclasses.dataclass(frozen=True)
 class Result:
     """Every converged state of a clamping."""
 
@@ -64,6 +75,24 @@ class Result:
     failure: EquilibriumError | None
     solver: dict[str, Any]
     cost: dict[str, Any]
+    linear_solvers: LinearSolvers = dataclasses.field(repr=False)
+
+    def measure(self, measure: Measure) -> float:
+        """The value of a measure in internal units (mm, kPa, mN, uJ), from the states at hand."""
+        assert self.physiological is not None, "the artery has not reached its physiological state"
+        return float(measure(self.seen))
+
+    @property
+    def seen(self) -> Seen:
+        """The body with its physiological state and, if it was closed, its last one."""
+        assert self.physiological is not None
+        last = self.states[-1]
+        return Seen(
+            body=self.model.body,
+            marks=self.model.marks,
+            physiological=self.physiological.state,
+            stop=last.state if last.stage == "clamping" else None,
+        )
 
     @property
     def scene(self) -> Scene:

@@ -307,3 +307,20 @@ def test_the_study_of_2002_with_printed_equation_10():
     assert content["physiological"]["lumen_radius_mm"] == pytest.approx(2.524, abs=1e-3)
     assert final["lumen_height_mm"] == pytest.approx(0.378, abs=1e-3)
     assert final["lumen_width_mm"] == pytest.approx(6.047, abs=0.02)
+
+
+@pytest.mark.parametrize("occlusion", [0.97, 0.99])
+def test_the_inner_walls_meet_and_carry_load(occlusion):
+    """Past first contact of the intima with itself: still in balance, nothing sinks in far."""
+    scene = jc.load_scene("human-lad", [f"stop.occlusion={occlusion}"])
+    result = jc.clamp(scene)
+    wall = result.physiological.values["outer_radius_mm"] - result.physiological.values["lumen_height_mm"] / 2
+    assert result.final["occlusion"] == pytest.approx(occlusion, abs=1e-7)
+    assert result.final["lumen_contact_force_N"] > 0.0
+    assert result.final["lumen_contact_force_N"] < result.final["clamp_force_N"]
+    assert 0.0 < result.final["lumen_overlap_mm"] < 0.2 * wall
+    assert result.final["force_balance_error"] < 1e-8
+    assert result.solver["work_balance_error"] < 1e-3
+    open_states = [record for record in result.history if record["lumen_overlap_mm"] <= 0.0]
+    assert all(record["lumen_contact_force_N"] == 0.0 for record in open_states)
+    assert len(open_states) >= 3

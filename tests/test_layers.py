@@ -9,6 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "jaxclamp"
 
 LEVEL = {
     "pytree": 0,
+    "worker": 0,
     "tensors": 0,
     "presets": 0,
     "console": 0,
@@ -29,10 +30,12 @@ LEVEL = {
     "equilibrium": 7,
     "model": 7,
     "fields": 8,
+    "objectives": 8,
     "plots": 9,
     "results": 10,
     "clamping": 11,
     "paraview": 12,
+    "sensitivity": 12,
     "report": 12,
     "export": 13,
     "cli": 14,

@@ -1,0 +1,92 @@
+"""What a study leaves on disk while it runs: study.json, whole or not at all, and iterations.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from jaxclamp import SceneError
+from jaxclamp.console import as_json
+
+STUDY, ITERATIONS, LOCK = "study.json", "iterations.csv", ".study.lock"
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file under a temporary name and rename it: it is there whole, or as it was before."""
+    temporary = path.with_name(f".{path.name}.writing")
+    try:
+        with temporary.open("w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+class Journal:
+    """The folder of one study, held by one process at a time."""
+
+    def __init__(self, folder: Path, resume: bool) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        self._lock = FileLock(folder / LOCK)
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise SceneError(f"{folder}: another study is writing there") from None
+        self.found = self._read()
+        if self.found and not resume:
+            self.close()
+            raise SceneError(
+                f"{folder} holds a study already: continue it with --resume, or take another folder"
+            )
+
+    def _read(self) -> dict[str, Any]:
+        """The study that is there; empty if there is none."""
+        path = self.folder / STUDY
+        if not path.exists():
+            return {}
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            found = None
+        if not isinstance(found, dict):
+            self.close()
+            raise SceneError(f"{path}: expected a study that this program has written")
+        return found
+
+    def write(self, content: dict[str, Any], rows: list[dict[str, Any]]) -> None:
+        """Rewrite study.json and bring iterations.csv up to its rows. Raises OSError."""
+        write_whole(self.folder / STUDY, as_json(content) + "\n")
+        path = self.folder / ITERATIONS
+        if self._rows_written == len(rows) - 1 and path.exists():
+            with path.open("a", encoding="utf-8", newline="") as file:
+                file.write(_csv(rows[-1:], header=False))
+        else:
+            write_whole(path, _csv(rows, header=True))
+        self._rows_written = len(rows)
+
+    _rows_written = -1
+
+    def close(self) -> None:
+        """Let others write here."""
+        self._lock.release()
+
+
+def _csv(rows: list[dict[str, Any]], header: bool) -> str:
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, list(rows[0]) if rows else [], lineterminator="\n")
+    if header:
+        writer.writeheader()
+    writer.writerows(rows)
+    return buffer.getvalue()
