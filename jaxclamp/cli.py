@@ -1,4 +1,4 @@
-"""The command line: `jaxclamp show`, `run` and `presets`.
+"""The command line: `jaxclamp show`, `run`, `optimise` and `presets`.
 
 Exit codes: 0 done; 2 the input is wrong; 3 no converged solution; 4 the machine refused; 130
 interrupted. What went wrong is one sentence on standard error. Results go to standard output,
@@ -97,6 +97,8 @@ def _refusal(error: Exception) -> tuple[str, int] | None:
         return str(error), WRONG_INPUT
     if (usage := getattr(error, "format_message", None)) is not None:  # of the command itself
         return usage(), WRONG_INPUT
+    if type(error).__name__ == "EquilibriumError":
+        return str(error), NOT_CONVERGED
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return (
             "not enough memory: take a coarser mesh (--fidelity draft, or fewer mesh elements)",
@@ -176,11 +178,42 @@ def run(
 
 
 @app.command()
+def optimise(
+    study: Annotated[str, typer.Argument(metavar="STUDY", help="A TOML file or the name of a preset.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for the study.", show_default="./STUDY-study"),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the study in that folder.")] = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Change the jaw's shape (or any floats of a scene) to lower an objective at the stop."""
+    from optimize.report import warning, write_study
+    from optimize.study_file import load_study
+
+    asked = load_study(study)
+    folder = out or Path(f"{Path(study).stem}-study")
+    _check_folder(folder)
+    with console.progress(quiet) as progress:
+        tell = progress if callable(progress) else None
+        found = asked.run(folder, resume, tell)
+        files = write_study(found, folder, asked.title, tell)
+    if as_json:
+        typer.echo(console.as_json(found.to_dict()))
+    elif not quiet:
+        typer.echo("\n".join([asked.title, *found.lines(), "", *(f"  open {path}" for path in files)]))
+    if (said := warning(found)) is not None:
+        typer.echo(f"jaxclamp: warning: {said}", err=True)
+    return DONE
+
+
+@app.command()
 def presets(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Print the TOML of this one.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List what ships: scenes, arteries and jaws; or print one of them."""
+    """List what ships: scenes, arteries, jaws and studies; or print one of them."""
     if name is not None:
         typer.echo(preset(name).text, nl=False)
         return

@@ -103,18 +103,23 @@ def page(result: Result, plates: Iterable[tuple[Plate, bytes]]) -> str:
     title = content["title"] or "Clamping of an artery"
     sections = [
         _opening(title, content, result),
-        _figures(plates),
-        _section("Numbers", _numbers(content, [layer.name for layer in result.scene.artery.layers])),
-        _section("Checks", _checks(checks(result))),
-        _section("Model", _model(content["model"])),
-        _section("Scene", f"<pre>{escape(dump_scene(result.scene))}</pre>"),
-        _section("Cost and versions", _cost(content)),
+        figure_section(plates),
+        section("Numbers", _numbers(content, [layer.name for layer in result.scene.artery.layers])),
+        section("Checks", _checks(checks(result))),
+        section("Model", _model(content["model"])),
+        section("Scene", f"<pre>{escape(dump_scene(result.scene))}</pre>"),
+        section("Cost and versions", _cost(content)),
     ]
+    return document(title, sections)
+
+
+def document(title: str, sections: Iterable[str]) -> str:
+    """A self-contained page of sections."""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        + "\n".join(section for section in sections if section)
+        + "\n".join(part for part in sections if part)
         + "\n</body>\n</html>\n"
     )
 
@@ -138,11 +143,12 @@ def number(value: Any, key: str = "") -> str:
     return f"{text} {unit}".rstrip()
 
 
-def _section(title: str, body: str) -> str:
+def section(title: str, body: str) -> str:
+    """A headed part of the page; nothing without a body."""
     return f"<section><h2>{escape(title)}</h2>\n{body}</section>" if body else ""
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers_from: int = 1) -> str:
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers_from: int = 1) -> str:
     """A table; texts are escaped here, cells from column `numbers_from` on are set flush right."""
 
     def row(cells: Sequence[str], tag: str) -> str:
@@ -174,7 +180,8 @@ def _opening(title: str, content: dict[str, Any], result: Result) -> str:
     return "\n".join(lines) + (f'\n<div class="headlines">{"".join(boxes)}</div>' if boxes else "")
 
 
-def _figures(plates: Iterable[tuple[Plate, bytes]]) -> str:
+def figure_section(plates: Iterable[tuple[Plate, bytes]]) -> str:
+    """The figures, embedded, with their captions."""
     parts = []
     for plate, image in plates:
         data = base64.b64encode(image).decode("ascii")
@@ -184,7 +191,7 @@ def _figures(plates: Iterable[tuple[Plate, bytes]]) -> str:
             f'src="data:image/png;base64,{data}"><figcaption><b>{escape(plate.title)}.</b> '
             f"{escape(plate.caption)}</figcaption></figure>"
         )
-    return _section("Figures", "\n".join(parts))
+    return section("Figures", "\n".join(parts))
 
 
 def _numbers(content: dict[str, Any], layers: list[str]) -> str:
@@ -193,10 +200,10 @@ def _numbers(content: dict[str, Any], layers: list[str]) -> str:
         ["lumen radius, load-free", number(content["load_free"]["lumen_radius_mm"], "_mm"), "–"],
         ["lumen radius, in the body", number(content["physiological"]["lumen_radius_mm"], "_mm"), "–"],
     ]
-    parts = [_table(["before clamping", "value"], [row[:2] for row in rows])]
+    parts = [table(["before clamping", "value"], [row[:2] for row in rows])]
     if final:
         rows = [[label, number(body.get(key), key), number(final.get(key), key)] for key, label in NUMBERS]
-        parts.append(_table(["", "in the body", "last state"], rows))
+        parts.append(table(["", "in the body", "last state"], rows))
         rows = [
             [f"{label} (kPa)", *(number(final[key].get(name)) for name in layers)]
             for key, label in PEAKS
@@ -205,7 +212,7 @@ def _numbers(content: dict[str, Any], layers: list[str]) -> str:
         places = final.get("peak_axial_stress_location_mm") or {}
         at = ["place of the axial peak: x, y, z (mm)"]
         at += [", ".join(f"{abs(c):.2f}" for c in places.get(name) or []) for name in layers]
-        parts.append(_table(["highest stress in the last state", *layers], [*rows, at]))
+        parts.append(table(["highest stress in the last state", *layers], [*rows, at]))
         parts.append(
             '<p class="faint">Lumen sizes are those of the whole artery at mid-length. Peaks are over the '
             "quadrature points; x runs along the fold axis, y along the compression axis, z along the "
@@ -292,7 +299,7 @@ def _model(model: dict[str, Any]) -> str:
             if key in said]  # fmt: skip
     terms = model["terms"]
     rows += list(terms.items()) if isinstance(terms, dict) else [("term", str(term)) for term in terms]
-    return _table(["", ""], rows, numbers_from=2)
+    return table(["", ""], rows, numbers_from=2)
 
 
 def _cost(content: dict[str, Any]) -> str:
@@ -310,4 +317,4 @@ def _cost(content: dict[str, Any]) -> str:
         ):
             rows.append((label, value if isinstance(value, str) else number(value, key)))
     rows += [(name, str(version)) for name, version in content["versions"].items()]
-    return _table(["", ""], rows)
+    return table(["", ""], rows)

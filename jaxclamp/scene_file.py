@@ -36,7 +36,7 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = (), fidelity
     fidelity: the mesh where the file leaves it out: "draft", "standard" or "reference".
     Raises SceneError.
     """
-    text, source = _text(name_or_path)
+    text, source = read_text(name_or_path)
     return loads_scene(text, source=source, overrides=overrides, fidelity=fidelity)
 
 
@@ -81,7 +81,7 @@ def mesh_for(fidelity: str, artery: Artery) -> MeshSettings:
 
 def own_mesh_keys(name_or_path: str | Path) -> list[str]:
     """The mesh counts that the file or preset itself fixes, so that no fidelity changes them."""
-    text, source = _text(name_or_path)
+    text, source = read_text(name_or_path)
     mesh = _parsed(text, source).get("mesh", {})
     return [key for key in ("circumferential", "axial", "radial") if isinstance(mesh, dict) and key in mesh]
 
@@ -99,19 +99,19 @@ def _shares(total: int, sizes: list[float]) -> tuple[int, ...]:
 # --------------------------------------------------------------------------------- text to table
 
 
-def _text(name_or_path: str | Path) -> tuple[str, str]:
-    """The TOML text of a file or of a preset, and the name it goes by in errors."""
+def read_text(name_or_path: str | Path, kind: str = "scene") -> tuple[str, str]:
+    """The TOML text of a file or of a preset of that kind, and the name it goes by in errors."""
     path = Path(name_or_path)
     looks_like_a_file = isinstance(name_or_path, Path) or path.suffix == ".toml" or path.name != name_or_path
     if not looks_like_a_file and not path.is_file():
-        found = preset(str(name_or_path), "scene")
+        found = preset(str(name_or_path), kind)
         return found.text, found.name
     source = str(path) if str(path).isprintable() else ascii(str(path))
     try:
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)
         if len(content) > LARGEST_FILE:
-            raise SceneError(f"{source}: expected a scene file of at most {LARGEST_FILE // 1000} kB")
+            raise SceneError(f"{source}: expected a {kind} file of at most {LARGEST_FILE // 1000} kB")
         return content.decode("utf-8-sig"), source
     except FileNotFoundError:
         raise SceneError(f"{source}: there is no such file") from None

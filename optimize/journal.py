@@ -19,11 +19,16 @@ STUDY, ITERATIONS, LOCK = "study.json", "iterations.csv", ".study.lock"
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file under a temporary name and rename it: it is there whole, or as it was before."""
+    """Write a text file; it is there whole, or as it was before. Raises OSError."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file under a temporary name and rename it. Raises OSError."""
     temporary = path.with_name(f".{path.name}.writing")
     try:
-        with temporary.open("w", encoding="utf-8", newline="") as file:
-            file.write(text)
+        with temporary.open("wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

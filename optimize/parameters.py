@@ -21,12 +21,13 @@ class Variable:
     """A float of the scene that the design may change, or all floats of a list.
 
     path: as for `jaxclamp.replace`, such as "clamp.jaw.radius"
-    lower, upper: bounds in internal units (mm, kPa, mN, radians); None: the range of the field
+    lower, upper: bounds in internal units (mm, kPa, mN, radians), one for all items of a list or one
+    for each; None: the range of the field
     """
 
     path: str
-    lower: float | None = None
-    upper: float | None = None
+    lower: float | tuple[float, ...] | None = None
+    upper: float | tuple[float, ...] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,11 +79,11 @@ def entries(scene: Scene, variables: tuple[Variable, ...]) -> tuple[Entry, ...]:
     for variable in variables:
         path, value, interval = resolve(scene, variable.path)
         factor = UNIT_FACTOR[interval.unit]
-        lower = interval.lower * factor if variable.lower is None else variable.lower
-        upper = interval.upper * factor if variable.upper is None else variable.upper
         key = f"{path}_{interval.unit}" if interval.unit else path
         values = np.atleast_1d(np.asarray(value, dtype=float))
-        for number, start in enumerate(values.tolist()):
+        lowest = _bounds(variable.lower, interval.lower * factor, values.size, key)
+        highest = _bounds(variable.upper, interval.upper * factor, values.size, key)
+        for number, (start, lower, upper) in enumerate(zip(values.tolist(), lowest, highest, strict=True)):
             name = key if np.ndim(value) == 0 else f"{key}[{number}]"
             inside = interval.lower <= lower / factor and upper / factor <= interval.upper
             if not (lower < upper and inside):
@@ -101,6 +102,14 @@ def entries(scene: Scene, variables: tuple[Variable, ...]) -> tuple[Entry, ...]:
     if len({entry.name for entry in found}) < len(found):
         raise SceneError("a variable is named twice")
     return tuple(found)
+
+
+def _bounds(given: float | tuple[float, ...] | None, default: float, count: int, key: str) -> list[float]:
+    """A bound for each item."""
+    bounds = np.ravel(default if given is None else given).astype(float).tolist()
+    if len(bounds) not in (1, count):
+        raise SceneError(f"{key}: expected 1 or {count} bounds, found {len(bounds)}")
+    return bounds if len(bounds) == count else bounds * count
 
 
 def with_design(scene: Scene, paths: tuple[str, ...], design: Array | np.ndarray) -> Scene:

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxclamp import EquilibriumError, Result, Scene, clamp
+from jaxclamp import EquilibriumError, Result, Scene, SceneError, clamp, dump_scene
 from jaxclamp.model import Discretisation
 from jaxclamp.objectives import Measure
+from jaxclamp.scene_file import loads_scene
 from jaxclamp.sensitivity import Unknowns, implicit, register, see, solution
 from optimize.parameters import Entry, Variable, entries, resolve, with_design
 
@@ -46,6 +47,8 @@ class DesignProblem:
     objective: Measure
     variables: tuple[Variable, ...]
     constraints: tuple[Constraint, ...] = ()
+    reference: Scene | None = None
+    """another clamp to compare with, such as the one in use"""
 
     @cached_property
     def entries(self) -> tuple[Entry, ...]:
@@ -86,6 +89,8 @@ class Evaluation:
     gradients: np.ndarray
     """their derivatives, (n_measures, n_variables)"""
     newton_iterations: int
+    start: int = 1
+    """number of the start design it was reached from"""
     failure: str | None = None
     """why there is no equilibrium; values and gradients mean nothing then"""
 
@@ -135,16 +140,30 @@ def _design_of(problem: DesignProblem, scene: Scene) -> np.ndarray:
     return np.concatenate(parts)
 
 
+def why_impossible(scene: Scene) -> str | None:
+    """What a scene file with these values would be refused for; None if it would not."""
+    try:
+        loads_scene(dump_scene(scene), "design")
+    except SceneError as error:
+        return str(error)
+    return None
+
+
 def evaluate(
     problem: DesignProblem, design: np.ndarray, near: Result | None
 ) -> tuple[Evaluation, Result | None]:
     """Solve a design, from a neighbour's solution if there is one. A failure is an answer, no error."""
     design = np.asarray(design, float)
-    try:
-        result = clamp(problem.scene_at(design), guess=near)
-    except EquilibriumError as error:
+    scene = problem.scene_at(design)
+    failure, result = why_impossible(scene), None
+    if failure is None:
+        try:
+            result = clamp(scene, guess=near)
+        except EquilibriumError as error:
+            failure = str(error)
+    if result is None:
         n = len(problem.measures)
         nothing = np.full(n, math.nan), np.full((n, design.size), math.nan)
-        return Evaluation(design, *nothing, newton_iterations=0, failure=str(error)), None
+        return Evaluation(design, *nothing, newton_iterations=0, failure=failure), None
     values, slopes = gradients(problem, result)
     return Evaluation(design, values, slopes, result.solver["newton_iterations"]), result

@@ -10,18 +10,23 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import multiprocessing
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.stats
 
 from jaxclamp import EquilibriumError, Progress, Result, SceneError, clamp, dump_scene
+from jaxclamp.linear_solvers import cores
 from jaxclamp.results import versions
 from optimize.drivers import METHODS, Enough, Target
 from optimize.journal import Journal
-from optimize.problem import DesignProblem, Evaluation, evaluate
+from optimize.problem import DesignProblem, Evaluation, evaluate, why_impossible
 from optimize.verification import Verification, verify
 
 FEASIBLE = 1e-3
@@ -46,8 +51,26 @@ class Study:
     """the best design, solved from scratch"""
     best_design: np.ndarray
     """internal units"""
+    reference: Result | None
+    """the clamp to compare with, solved from scratch"""
     verification: Verification | None
     seconds: float
+
+    def lines(self) -> list[str]:
+        """What came of it, for a terminal."""
+        p = self.problem
+        named = {"start": self.start, "best": self.best}
+        if self.reference is not None:
+            named = {"reference": self.reference, **named}
+        said = [f"  {self.stopped_because}, {len(self.evaluations)} designs", ""]
+        for name, result in named.items():
+            peaks = ", ".join(f"{k} {v:.4g}" for k, v in result.final["peak_axial_stress_kPa"].items())
+            value = f"{result.measure(p.objective):.5g} {p.objective.unit}"
+            said.append(f"    {name:<10}{p.objective} = {value}; true peaks {peaks} kPa")
+        said += ["", "    best design"]
+        for entry, value in zip(p.entries, self.best_design, strict=True):
+            said.append(f"      {entry.name:<32}{value / entry.factor:>10.4g}")
+        return said if self.verification is None else [*said, "", f"    {self.verification.sentence}"]
 
     def to_dict(self) -> dict[str, Any]:
         """The content of study.json."""
@@ -56,6 +79,10 @@ class Study:
             start=self.start.final,
             best=self.best.final,
             best_design=self.best_design,
+            reference=None if self.reference is None else self.reference.final,
+            reference_value=None
+            if self.reference is None
+            else self.reference.measure(self.problem.objective),
             stopped_because=self.stopped_because,
             verification=self.verification,
             seconds=self.seconds,
@@ -87,7 +114,11 @@ class _Record:
     def row(self, number: int, e: Evaluation) -> dict[str, Any]:
         """A row of iterations.csv: file units for the design, the measures' own for the rest."""
         solved = e.failure is None
-        row: dict[str, Any] = {"evaluation": number, "objective": e.values[0] if solved else ""}
+        row: dict[str, Any] = {
+            "evaluation": number,
+            "start": e.start,
+            "objective": e.values[0] if solved else "",
+        }
         for constraint, value in zip(self.problem.constraints, e.values[1:], strict=True):
             row[f"{constraint.measure}"] = value if solved else ""
         row["violation"] = e.violation(self.problem) if solved else ""
@@ -137,6 +168,9 @@ class _Record:
             ],
             "start": block(known.get("start"), first),
             "best": block(known.get("best"), best),
+            "reference": None
+            if known.get("reference") is None
+            else {"objective": known["reference_value"], **known["reference"]},
             "best_is_feasible": best is not None and best.violation(p) <= FEASIBLE,
             "evaluations": len(self.evaluations),
             "gradient_evaluations": sum(e.failure is None for e in self.evaluations),
@@ -159,7 +193,7 @@ class _Record:
         """Take over the evaluations of a study.json. Raises SceneError if it is of another study."""
         if found.get("fingerprint") != self.fingerprint:
             raise SceneError("the study in that folder is another one: its scene, variables or method differ")
-        for row in found["iterations"]:
+        for row in (row for row in found["iterations"] if row["start"] == 1):
             missing = lambda v: np.array(v, dtype=object).astype(float)  # noqa: E731  null is nan
             self.evaluations.append(
                 Evaluation(
@@ -288,12 +322,15 @@ def minimise(
     folder: str | Path | None = None,
     resume: bool = False,
     progress: Callable[[Progress], Any] | None = None,
+    starts: int = 1,
     check_finer_mesh: bool = True,
 ) -> Study:
     """Find the design of least objective from the problem's scene on.
 
     method: "slsqp" or "mma" (with constraints), "l-bfgs-b" or "adam" (bounds only)
     tolerance: relative change of the objective that no longer matters
+    starts: designs to start from, the problem's own and others drawn between the bounds; the others run
+        in processes of their own (a script that asks for them needs `if __name__ == "__main__":`)
     folder: where study.json and iterations.csv are kept up to date; with `resume`, continued there
 
     Raises SceneError for a problem that makes no sense, EquilibriumError if the start has no solution.
@@ -307,22 +344,105 @@ def minimise(
         raise SceneError(f"method = '{method}' takes no constraints: expected one of {able}")
     record = _Record(problem, method, [])
     _ = problem.entries
-    journal = None if folder is None else Journal(Path(folder), resume)
+    place = None if folder is None else Path(folder)
+    budget = _Budget(method, max_evaluations, tolerance)
+    journal = None if place is None else Journal(place, resume)
     try:
         if journal is not None and journal.found:
             record.read(journal.found)
-        asker = _Asker(record, journal, max_evaluations, tell)
-        try:
-            stopped = chosen.drive(asker.target(tolerance))
-        except Enough:
-            stopped = f"{max_evaluations} evaluations"
-        study = _finish(record, asker.first, stopped, tell, check_finer_mesh, begun)
+        with _elsewhere(problem, budget, starts - 1, place, resume) as others:
+            first, stopped = _drive(record, budget, journal, tell)
+            if others:
+                tell(Progress("optimising", 1.0, f"waiting for {len(others)} other starts"))
+            for number, other in enumerate(others, 2):
+                record.evaluations += [dataclasses.replace(e, start=number) for e in other.result()]
+        study = _finish(record, first, stopped, tell, check_finer_mesh, begun)
         if journal is not None:
             journal.write(study.to_dict(), record.rows())
         return study
     finally:
         if journal is not None:
             journal.close()
+
+
+@dataclasses.dataclass(frozen=True)
+class _Budget:
+    method: str
+    max_evaluations: int
+    tolerance: float
+
+
+def _drive(
+    record: _Record, budget: _Budget, journal: Journal | None, tell: Callable[[Progress], Any]
+) -> tuple[Result | None, str]:
+    """Let the driver work until it is content or the budget is spent; the first result, and why it ended."""
+    asker = _Asker(record, journal, budget.max_evaluations, tell)
+    try:
+        stopped = METHODS[budget.method].drive(asker.target(budget.tolerance))
+    except Enough:
+        stopped = f"{budget.max_evaluations} evaluations"
+    return asker.first, stopped
+
+
+@contextmanager
+def _elsewhere(
+    problem: DesignProblem, budget: _Budget, count: int, folder: Path | None, resume: bool
+) -> Iterator[list[Future[list[Evaluation]]]]:
+    """Studies from other starts in processes of their own; ended with the block if it fails."""
+    if count < 1:
+        yield []
+        return
+    pool = ProcessPoolExecutor(min(count, cores()), mp_context=multiprocessing.get_context("spawn"))
+    try:
+        yield [
+            pool.submit(
+                _from_another_start,
+                dataclasses.replace(problem, scene=problem.scene_at(design)),
+                budget,
+                None if folder is None else folder / f"start-{number}",
+                resume,
+            )
+            for number, design in enumerate(other_starts(problem, count), 2)
+        ]
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def other_starts(problem: DesignProblem, count: int) -> list[np.ndarray]:
+    """Designs spread over the box (a scrambled Sobol' sequence with a fixed seed) that make sense."""
+    lower, upper = problem.bounds
+    draws = scipy.stats.qmc.Sobol(lower.size, rng=np.random.default_rng(0))
+    found: list[np.ndarray] = []
+    for _ in range(MOST_DRAWS):
+        for t in draws.random(8):
+            # half way to the start: the box's corners are seldom sensible
+            design = 0.5 * (problem.start + lower + t * (upper - lower))
+            if why_impossible(problem.scene_at(design)) is None:
+                found.append(design)
+        if len(found) >= count:
+            break
+    return found[:count]
+
+
+MOST_DRAWS = 64
+
+
+def _from_another_start(
+    problem: DesignProblem, budget: _Budget, folder: Path | None, resume: bool
+) -> list[Evaluation]:
+    """The evaluations of a study from another start; none if that has no equilibrium."""
+    record = _Record(problem, budget.method, [])
+    journal = None if folder is None else Journal(folder, resume)
+    try:
+        if journal is not None and journal.found:
+            record.read(journal.found)
+        _drive(record, budget, journal, lambda event: None)
+    except (EquilibriumError, SceneError):
+        return []
+    finally:
+        if journal is not None:
+            journal.close()
+    return record.evaluations
 
 
 COLD_AGREES = 1e-4
@@ -341,10 +461,14 @@ def _finish(
     problem = record.problem
     tell(Progress("verifying", 0.0, "start and best from scratch"))
     start = first or clamp(problem.scene)
-    best = _found_cold(record, start)
-    tell(Progress("verifying", 0.3, "on a finer mesh, with stiffer and sharper contact"))
-    design = next(e.design for e in record.evaluations if e is best[0])
-    verification = verify(problem, start, best[1]) if check_finer_mesh else None
+    best, result = _found_cold(record, start)
+    named = {"start": start, "best": result}
+    if problem.reference is not None:
+        named["reference"] = clamp(problem.reference)
+    verification = None
+    if check_finer_mesh:
+        tell(Progress("verifying", 0.3, "on a finer mesh, with stiffer and sharper contact"))
+        verification = verify(problem, named)
     tell(Progress("verifying", 1.0, "" if verification is None else verification.sentence))
     return Study(
         problem=problem,
@@ -352,8 +476,9 @@ def _finish(
         evaluations=tuple(record.evaluations),
         stopped_because=stopped,
         start=start,
-        best=best[1],
-        best_design=design,
+        best=result,
+        best_design=best.design,
+        reference=named.get("reference"),
         verification=verification,
         seconds=time.perf_counter() - begun,
     )

@@ -8,39 +8,46 @@ from typing import Any
 from jaxclamp import EquilibriumError, Result, Scene, clamp, replace
 from optimize.problem import DesignProblem
 
-STIFFER = 4.0
+STIFFER = 2.0
 """contact stiffness times, and smoothing divided by, this"""
 
 
 def finer(scene: Scene) -> Scene:
-    """Twice the elements along the artery, where the jaw's shape acts, and harder contact."""
-    scene = dataclasses.replace(scene, mesh=dataclasses.replace(scene.mesh, axial=2 * scene.mesh.axial))
+    """Half as many elements again along the artery, where the jaw's shape acts, and harder contact."""
+    axial = -(-3 * scene.mesh.axial // 2)
+    scene = dataclasses.replace(scene, mesh=dataclasses.replace(scene.mesh, axial=axial))
     scene = replace(scene, "contact.stiffness", STIFFER * scene.contact.stiffness)
     return replace(scene, "contact.smoothing", scene.contact.smoothing / STIFFER)
 
 
 @dataclasses.dataclass(frozen=True)
 class Verification:
-    """Objective and final record of start and best on the finer model; None where it did not converge."""
+    """Start, best (and reference) on the finer model; None where it has no equilibrium."""
 
-    objective: dict[str, float | None]
-    """of start and best, internal units"""
     coarse: dict[str, float]
+    """objective on the study's own model, internal units"""
+    fine: dict[str, float | None]
+    """objective on the finer model"""
     final: dict[str, dict[str, Any] | None]
+    """final record on the finer model"""
     failure: str | None
     elements: int
 
     @property
+    def gain_before(self) -> float:
+        """Share by which the objective falls from start to best on the study's own model."""
+        return 1.0 - self.coarse["best"] / self.coarse["start"]
+
+    @property
     def gain(self) -> float | None:
-        """Share by which the objective falls on the finer model; None if that is not known."""
-        start, best = self.objective["start"], self.objective["best"]
+        """The same on the finer model; None if that is not known."""
+        start, best = self.fine["start"], self.fine["best"]
         return None if start is None or best is None else 1.0 - best / start
 
     @property
     def survives(self) -> bool:
         """True if at least half of the gain is there on the finer model, or there was none to lose."""
-        coarse = 1.0 - self.coarse["best"] / self.coarse["start"]
-        return self.gain is not None and self.gain >= 0.5 * coarse
+        return self.gain is not None and self.gain >= 0.5 * self.gain_before
 
     @property
     def sentence(self) -> str:
@@ -48,37 +55,31 @@ class Verification:
         if self.gain is None:
             return f"the finer model has no equilibrium: {self.failure}"
         verdict = "the gain survives" if self.survives else "THE GAIN DOES NOT SURVIVE"
-        coarse = 1.0 - self.coarse["best"] / self.coarse["start"]
         model = f"{self.elements} elements with harder contact"
-        return f"{verdict} on {model}: {self.gain:.1%} ({coarse:.1%} before)"
+        return f"{verdict} on {model}: {self.gain:.1%} ({self.gain_before:.1%} before)"
 
     def to_dict(self) -> dict[str, Any]:
         """As in study.json."""
         blocks = {
-            name: None if final is None else {"objective": self.objective[name], **final}
+            name: None if final is None else {"objective": self.fine[name], **final}
             for name, final in self.final.items()
         }
-        return {
-            **blocks,
-            "gain": self.gain,
-            "survives": self.survives,
-            "elements": self.elements,
-            "failure": self.failure,
-        }
+        said = {"gain": self.gain, "survives": self.survives, "elements": self.elements}
+        return {**blocks, **said, "failure": self.failure}
 
 
-def verify(problem: DesignProblem, start: Result, best: Result) -> Verification:
-    """Solve start and best from scratch on the finer model."""
-    objective: dict[str, float | None] = {"start": None, "best": None}
-    final: dict[str, dict[str, Any] | None] = {"start": None, "best": None}
+def verify(problem: DesignProblem, results: dict[str, Result]) -> Verification:
+    """Solve results ("start", "best" and perhaps more) from scratch on the finer model."""
+    fine: dict[str, float | None] = dict.fromkeys(results)
+    final: dict[str, dict[str, Any] | None] = dict.fromkeys(results)
     failure, elements = None, 0
-    for name, result in (("start", start), ("best", best)):
+    for name, result in results.items():
         try:
-            fine = clamp(finer(result.scene))
+            found = clamp(finer(result.scene))
         except EquilibriumError as error:
             failure = f"{name}: {error}"
             continue
-        objective[name], final[name] = fine.measure(problem.objective), fine.final
-        elements = fine.model.mesh.n_cells
-    coarse = {"start": start.measure(problem.objective), "best": best.measure(problem.objective)}
-    return Verification(objective, coarse, final, failure, elements)
+        fine[name], final[name] = found.measure(problem.objective), found.final
+        elements = found.model.mesh.n_cells
+    coarse = {name: result.measure(problem.objective) for name, result in results.items()}
+    return Verification(coarse, fine, final, failure, elements)

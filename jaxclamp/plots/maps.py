@@ -24,7 +24,7 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
     """Axial Cauchy stress of every layer in the last state, on one colour scale."""
     kept = final_state(result)
     layers = layer_fields(result.model, kept.state)
-    zoom = _zoom(result, layers)
+    zoom = half_length_shown(result, layers)
     limits = nice_limits(
         [layer.point_data[FIELD][np.abs(layer.points[:, 2]) <= zoom] for layer in layers], 5.0
     )
@@ -35,7 +35,7 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
         first, end = result.model.mesh.layer_cells[number]
         P = first <= result.model.marks.P_cell < end
         map_axes, view_axes = (figure.add_subplot(grid[number, column]) for column in (0, 1))
-        _unrolled(map_axes, layer, _angles(result, number), zoom, scale, P)
+        unrolled(map_axes, layer, load_free_angles(result, number), zoom, scale, P)
         last = number == len(layers) - 1
         dress(
             map_axes,
@@ -52,7 +52,7 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
     return figure
 
 
-def _zoom(result: Clamped, layers: tuple[LayerFields, ...]) -> float:
+def half_length_shown(result: Clamped, layers: tuple[LayerFields, ...]) -> float:
     """Half the length of artery shown, mm."""
     size = float(np.max(layers[-1].points[:, 0]))
     end = float(np.max(layers[-1].points[:, 2]))
@@ -62,7 +62,7 @@ def _zoom(result: Clamped, layers: tuple[LayerFields, ...]) -> float:
 # --------------------------------------------------------------------------------- unrolled
 
 
-def _angles(result: Clamped, layer: int) -> np.ndarray:
+def load_free_angles(result: Clamped, layer: int) -> np.ndarray:
     """Angle of the circumferential grid lines in the load-free tube, deg, (n_c,)."""
     assert result.load_free is not None
     grid = result.model.mesh.grid
@@ -71,7 +71,7 @@ def _angles(result: Clamped, layer: int) -> np.ndarray:
     return np.degrees(np.arctan2(quarter[:, 1], quarter[:, 0]))
 
 
-def _unrolled(
+def unrolled(
     axes: Axes, layer: LayerFields, angles: np.ndarray, zoom: float, scale: ScalarMappable, mark_P: bool
 ) -> None:
     """Angle in the load-free tube (fold, jaw, fold) against current position along the artery."""

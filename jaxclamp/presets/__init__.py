@@ -17,6 +17,7 @@ KINDS = {
     "scene": ("scenes", "as SCENE"),
     "artery": ("arteries", "as the value of artery"),
     "jaw": ("jaws", "as the value of clamp.jaw"),
+    "study": ("studies", "as STUDY of jaxclamp optimise"),
 }
 
 

@@ -1,0 +1,182 @@
+"""Figures of a study: profiles, stress on one scale, convergence, force against travel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+
+from jaxclamp import Result
+from jaxclamp.fields import layer_fields
+from jaxclamp.plots import Plate
+from jaxclamp.plots.maps import FIELD, half_length_shown, load_free_angles, unrolled
+from jaxclamp.plots.style import (
+    AXIAL,
+    CIRCUMFERENTIAL,
+    FAINT,
+    INK,
+    NORMAL,
+    SMALL,
+    THIRD,
+    Picture,
+    dress,
+    legend,
+    nice_limits,
+    plain,
+    stress_colours,
+)
+from optimize.study import FEASIBLE, Study
+
+COLOURS = {"reference": FAINT, "start": CIRCUMFERENTIAL, "best": AXIAL}
+
+
+def shown(study: Study) -> dict[str, Result]:
+    """The clamps that a study compares, by name."""
+    reference = {} if study.reference is None else {"reference": study.reference}
+    return {**reference, "start": study.start, "best": study.best}
+
+
+def profile(result: Result) -> tuple[np.ndarray, np.ndarray]:
+    """The jaw's face along the artery: z and height above its lowest point, mm, from the gap itself."""
+    jaw = result.scene.clamp.jaw
+    reach = float(jaw.half_extent())
+    z = np.linspace(-1.02 * reach, 1.02 * reach, 401)
+    height = np.linspace(-0.2, 2.0 * reach, 801)
+    along, up = np.meshgrid(z, height, indexing="ij")
+    inside = np.asarray(jaw.gap(jnp.stack([0.0 * along, up, along])))
+    first = np.argmax(inside < 0.0, axis=1)
+    found = np.any(inside < 0.0, axis=1) & (first > 0)
+    before, after = (np.take_along_axis(inside, (first - k)[:, None], 1)[:, 0] for k in (1, 0))
+    share = before / np.where(before == after, 1.0, before - after)
+    y = height[first - 1] + share * (height[1] - height[0])
+    return z, np.where(found, y, np.nan)
+
+
+def plot_profiles(study: Study) -> Picture:
+    """The faces of the jaws along the artery, to scale."""
+    figure = Picture(7.2, 3.0)
+    axes = figure.add_subplot()
+    for name, result in shown(study).items():
+        z, y = profile(result)
+        axes.plot(z, y, color=COLOURS[name], linewidth=2.2 if name == "best" else 1.4, label=name)
+    dress(axes, "position along the artery (mm)", "height (mm)", "Face of the upper jaw, to scale")
+    axes.set_aspect("equal")
+    axes.set_ylim(-0.15, 2.2)
+    legend(axes, loc="upper center", ncols=3)
+    return figure
+
+
+def plot_stress(study: Study) -> Picture:
+    """Axial stress of every layer at the stop, start and best side by side on one scale."""
+    results = shown(study)
+    layers = {name: layer_fields(r.model, r.states[-1].state) for name, r in results.items()}
+    reach = min(half_length_shown(r, layers[name]) for name, r in results.items())
+    values = [
+        layer.point_data[FIELD][np.abs(layer.points[:, 2]) <= reach]
+        for parts in layers.values()
+        for layer in parts
+    ]
+    scale = ScalarMappable(Normalize(*nice_limits(values, 5.0)), stress_colours())
+    rows = len(next(iter(layers.values())))
+    figure = Picture(3.4 * len(results) + 0.8, 2.7 * rows + 0.3)
+    grid = figure.subplots(rows, len(results), squeeze=False, sharex=True, sharey=True)
+    for column, (name, result) in enumerate(results.items()):
+        for row, layer in enumerate(layers[name]):
+            axes: Axes = grid[row, column]
+            first, end = result.model.mesh.layer_cells[row]
+            P = first <= result.model.marks.P_cell < end
+            unrolled(axes, layer, load_free_angles(result, row), reach, scale, P)
+            dress(
+                axes,
+                "position along the artery (mm)" if row == rows - 1 else "",
+                "angle from the fold (deg)" if column == 0 else "",
+                f"{name}: {plain(layer.name)}",
+                grid=False,
+            )
+    bar = figure.colorbar(scale, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
+    bar.set_label("axial Cauchy stress (kPa)", fontsize=NORMAL, color=INK)
+    bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
+    bar.outline.set_visible(False)
+    return figure
+
+
+def plot_convergence(study: Study) -> Picture:
+    """Objective of every evaluation, and of the best feasible one so far."""
+    figure = Picture(6.4, 3.4)
+    axes = figure.add_subplot()
+    solved = [(n + 1, e) for n, e in enumerate(study.evaluations) if e.failure is None]
+    good = [(n, float(e.values[0])) for n, e in solved if e.violation(study.problem) <= FEASIBLE]
+    bad = [(n, float(e.values[0])) for n, e in solved if e.violation(study.problem) > FEASIBLE]
+    failed = [n + 1 for n, e in enumerate(study.evaluations) if e.failure is not None]
+    axes.plot(*np.transpose(good), "o", color=CIRCUMFERENTIAL, markersize=5, label="feasible")
+    if bad:
+        axes.plot(
+            *np.transpose(bad), "o", color=CIRCUMFERENTIAL, fillstyle="none", label="violates a constraint"
+        )
+    best = np.minimum.accumulate([value for _, value in good])
+    axes.step([n for n, _ in good], best, where="post", color=AXIAL, linewidth=1.8, label="best so far")
+    values = [value for _, value in good]
+    low, high = min(values), max(values[0], float(np.median(values)))
+    axes.set_ylim(low - 0.1 * (high - low or 1.0), high + 0.6 * (high - low or 1.0))
+    if failed:
+        level = np.full(len(failed), axes.get_ylim()[1])
+        axes.plot(failed, level, "x", color=THIRD, clip_on=False, label="no equilibrium")
+    objective = study.problem.objective
+    dress(axes, "evaluation", f"{objective.name.replace('_', ' ')} ({objective.unit})")
+    legend(axes)
+    return figure
+
+
+def plot_force_travel(study: Study) -> Picture:
+    """Force on one jaw against its travel."""
+    figure = Picture(5.6, 3.5)
+    axes = figure.add_subplot()
+    for name, result in shown(study).items():
+        history = result.history
+        axes.plot(
+            [record["jaw_travel_mm"] for record in history],
+            [record["clamp_force_N"] for record in history],
+            color=COLOURS[name],
+            marker="o",
+            markersize=3.5,
+            linewidth=1.8,
+            label=name,
+        )
+    dress(axes, "travel of each jaw (mm)", "force on one jaw (N)")
+    axes.set_ylim(bottom=0.0)
+    legend(axes)
+    return figure
+
+
+PLATES = (
+    (
+        "profiles",
+        "The jaws",
+        "Faces of the jaws along the artery, symmetric about the middle.",
+        plot_profiles,
+    ),
+    (
+        "stress",
+        "Axial stress at the stop",
+        "Each layer unrolled, with the highest axial Cauchy stress through its thickness, on one colour "
+        "scale; crosses mark the highest of all.",
+        plot_stress,
+    ),
+    (
+        "convergence",
+        "Convergence",
+        "The objective of every design that was solved. Far outliers of the line search are cut off.",
+        plot_convergence,
+    ),
+    ("force_travel", "Force", "Force on one jaw against the travel of each jaw.", plot_force_travel),
+)
+
+
+def figures(study: Study) -> Iterator[Plate]:
+    """All figures of a study."""
+    for name, title, caption, draw in PLATES:
+        yield Plate(name, title, caption, draw(study))

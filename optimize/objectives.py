@@ -1,0 +1,91 @@
+"""The measures that a study file can name, with the units it writes them in."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jaxclamp as jc
+from jaxclamp import Measure, SceneError
+from jaxclamp.presets import did_you_mean
+
+FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
+"""internal unit -> unit in files, and internal units in one of it; the others are the same"""
+
+FACTORIES: tuple[Callable[..., Measure], ...] = (
+    jc.smooth_peak_axial_stress,
+    jc.smooth_peak_circumferential_stress,
+    jc.smooth_peak_principal_stress,
+    jc.axial_stress_at_P,
+    jc.circumferential_stress_at_P,
+    jc.clamp_force,
+    jc.jaw_travel,
+    jc.lumen_height,
+    jc.lumen_width,
+    jc.lumen_area,
+    jc.mean_contact_pressure,
+    jc.smooth_peak_contact_pressure,
+    jc.volume_above,
+    jc.stored_energy,
+    jc.jaw_curvature,
+    jc.jaw_half_width,
+)
+
+_EXAMPLE: dict[str, Any] = {"layer": "media", "stress": 1.0}
+_KINDS: dict[str, Any] = {"layer": (str, "the name of a layer"), "stress": ((int, float), "a stress in kPa")}
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    """A measure as a file names it."""
+
+    key: str
+    factory: Callable[..., Measure]
+    factor: float
+    """internal units in one unit of the file"""
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        return tuple(inspect.signature(self.factory).parameters)
+
+
+def named() -> dict[str, Named]:
+    """All measures by their key, such as "clamp_force_N"."""
+    found = {}
+    for factory in FACTORIES:
+        example = factory(**{name: _EXAMPLE[name] for name in inspect.signature(factory).parameters})
+        unit, factor = FILE_UNIT.get(example.unit, (example.unit, 1.0))
+        key = f"{example.name}_{unit}" if unit else example.name
+        found[key] = Named(key, factory, factor)
+    return found
+
+
+def read_measure(
+    table: Any, path: str, layers: tuple[str, ...], others: tuple[str, ...] = ()
+) -> tuple[Measure, float]:
+    """The measure that a table of a study file asks for, and its factor. Raises SceneError.
+
+    layers: names of the artery's layers; others: further keys that the table may have
+    """
+    known = named()
+    if not isinstance(table, dict) or not isinstance(table.get("measure"), str):
+        raise SceneError(f"{path}: expected a table with measure = one of {', '.join(known)}")
+    key = table["measure"]
+    if key not in known:
+        raise SceneError(f"{path}.measure = {key!r}: no such measure; {did_you_mean(key, list(known))}")
+    chosen = known[key]
+    given = {}
+    for name in chosen.arguments:
+        kind, expected = _KINDS[name]
+        if not isinstance(table.get(name), kind) or isinstance(table.get(name), bool):
+            raise SceneError(f"{path}.{name} = {table.get(name)!r}: expected {expected}")
+        if name == "layer" and table[name] not in layers:
+            raise SceneError(f"{path}.layer = {table[name]!r}: expected one of {', '.join(layers)}")
+        given[name] = table[name]
+    allowed = ("measure", *chosen.arguments, *others)
+    for name in table:
+        if name not in allowed:
+            raise SceneError(f"unknown key {path}.{name}; {did_you_mean(name, list(allowed))}")
+    return chosen.factory(**given), chosen.factor

@@ -1,0 +1,188 @@
+"""Study files (TOML): a scene, what may change, what is minimised and what must hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxclamp import Progress, Scene, SceneError, load_scene, schema
+from jaxclamp.presets import did_you_mean
+from jaxclamp.pytree import UNIT_FACTOR
+from jaxclamp.scene_file import read_text
+from optimize.drivers import METHODS
+from optimize.objectives import read_measure
+from optimize.parameters import Variable, resolve
+from optimize.problem import Constraint, DesignProblem
+from optimize.study import Study, minimise
+
+KEYS = (
+    "title",
+    "scene",
+    "set",
+    "start",
+    "method",
+    "max_evaluations",
+    "tolerance",
+    "starts",
+    "objective",
+    "variables",
+    "constraints",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyFile:
+    """What a study file asks for."""
+
+    title: str
+    problem: DesignProblem
+    method: str
+    max_evaluations: int
+    tolerance: float
+    starts: int
+    """designs to start from: the file's, and others drawn between the bounds"""
+
+    def run(
+        self, folder: Path, resume: bool = False, progress: Callable[[Progress], Any] | None = None
+    ) -> Study:
+        """Do the study in a folder. Raises SceneError, EquilibriumError, OSError."""
+        return minimise(
+            self.problem,
+            method=self.method,
+            max_evaluations=self.max_evaluations,
+            tolerance=self.tolerance,
+            starts=self.starts,
+            folder=folder,
+            resume=resume,
+            progress=progress,
+        )
+
+
+def load_study(name_or_path: str | Path) -> StudyFile:
+    """The study of a preset or a TOML file. Raises SceneError."""
+    text, source = read_text(name_or_path, "study")
+    try:
+        table = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise SceneError(f"{source}: not valid TOML: {' '.join(str(error).split())}") from None
+    try:
+        return _study(table, Path(name_or_path).parent)
+    except SceneError as error:
+        said = str(error)
+        raise SceneError(said if said.startswith(source) else f"{source}: {said}") from None
+
+
+def _study(table: dict[str, Any], folder: Path) -> StudyFile:
+    for key in table:
+        if key not in KEYS:
+            raise SceneError(f"unknown key {key}; {did_you_mean(key, list(KEYS))}")
+    reference, start = _scenes(table, folder)
+    layers = tuple(layer.name for layer in start.artery.layers)
+    objective, _ = read_measure(table.get("objective"), "objective", layers)
+    problem = DesignProblem(
+        scene=start,
+        objective=objective,
+        variables=tuple(
+            _variable(item, start, f"variables[{i}]") for i, item in enumerate(_tables(table, "variables"))
+        ),
+        constraints=tuple(
+            _constraint(item, layers, f"constraints[{i}]")
+            for i, item in enumerate(_tables(table, "constraints"))
+        ),
+        reference=None if reference is start else reference,
+    )
+    _ = problem.entries
+    return StudyFile(
+        title=_text(table, "title", "Jaw study"),
+        problem=problem,
+        method=_choice(table, "method", "slsqp", tuple(METHODS)),
+        max_evaluations=_whole(table, "max_evaluations", 40, 1, 10_000),
+        tolerance=_number(table.get("tolerance", 1e-4), "tolerance", 1e-12, 1.0),
+        starts=_whole(table, "starts", 1, 1, 100),
+    )
+
+
+def _scenes(table: dict[str, Any], folder: Path) -> tuple[Scene, Scene]:
+    """The scene as it is, and with the jaw to start from."""
+    name = table.get("scene")
+    if not isinstance(name, str):
+        raise SceneError(f"scene = {schema.shown(name)}: expected a preset or a scene file")
+    beside = folder / name
+    scene: str | Path = beside if Path(name).suffix == ".toml" else name
+    changes = table.get("set", [])
+    if not isinstance(changes, list) or not all(isinstance(item, str) for item in changes):
+        raise SceneError('set: expected a list of overrides, such as ["mesh.axial=30"]')
+    reference = load_scene(scene, changes)
+    if "start" not in table:
+        return reference, reference
+    start = table["start"]
+    if not isinstance(start, dict) or set(start) != {"jaw"}:
+        raise SceneError("start: expected a table with jaw = a jaw's name or table")
+    return reference, load_scene(scene, [*changes, f"clamp.jaw={schema.toml_value(start['jaw'])}"])
+
+
+def _tables(table: dict[str, Any], key: str) -> list[Any]:
+    items = table.get(key, [])
+    if not isinstance(items, list):
+        raise SceneError(f"{key}: expected a list of tables, [[{key}]]")
+    return items
+
+
+def _variable(item: Any, scene: Scene, path: str) -> Variable:
+    if not isinstance(item, dict) or not isinstance(item.get("key"), str):
+        raise SceneError(f"{path}: expected a table with key, lower and upper")
+    for name in item:
+        if name not in ("key", "lower", "upper"):
+            raise SceneError(f"unknown key {path}.{name}; {did_you_mean(name, ['key', 'lower', 'upper'])}")
+    _, _, interval = resolve(scene, item["key"])
+    factor = UNIT_FACTOR[interval.unit]
+
+    def bound(side: str) -> tuple[float, ...] | None:
+        if side not in item:
+            return None
+        given = item[side] if isinstance(item[side], list) else [item[side]]
+        return tuple(factor * _number(v, f"{path}.{side}", -math.inf, math.inf) for v in given)
+
+    return Variable(item["key"], bound("lower"), bound("upper"))
+
+
+def _constraint(item: Any, layers: tuple[str, ...], path: str) -> Constraint:
+    measure, factor = read_measure(item, path, layers, ("lower", "upper"))
+    sides = {side: item[side] for side in ("lower", "upper") if side in item}
+    if not sides:
+        raise SceneError(f"{path}: expected lower, upper or both")
+    bounds = {side: factor * _number(value, f"{path}.{side}", -1e12, 1e12) for side, value in sides.items()}
+    return Constraint(measure, **bounds)
+
+
+def _number(value: Any, path: str, least: float, most: float) -> float:
+    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not good or not least <= value <= most:
+        where = f" from {least:g} to {most:g}" if math.isfinite(least) else ""
+        raise SceneError(f"{path} = {schema.shown(value)}: expected a number{where}")
+    return float(value)
+
+
+def _whole(table: dict[str, Any], key: str, default: int, least: int, most: int) -> int:
+    value = table.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise SceneError(f"{key} = {schema.shown(value)}: expected a whole number from {least} to {most}")
+    return value
+
+
+def _choice(table: dict[str, Any], key: str, default: str, choices: tuple[str, ...]) -> str:
+    value = table.get(key, default)
+    if value not in choices:
+        raise SceneError(f"{key} = {schema.shown(value)}: expected one of {', '.join(choices)}")
+    return str(value)
+
+
+def _text(table: dict[str, Any], key: str, default: str) -> str:
+    value = table.get(key, default)
+    if not isinstance(value, str) or not value.isprintable():
+        raise SceneError(f"{key} = {schema.shown(value)}: expected a text on one line")
+    return value

@@ -1,0 +1,278 @@
+"""Derivatives through equilibrium: against finite differences, against each other, against theory."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxclamp as jc
+from jaxclamp.sensitivity import implicit, register, see, solution
+from tube import SEED, Compressible
+from walks import mesh, tube_scene
+
+FEW = (
+    jc.smooth_peak_axial_stress("media"),
+    jc.clamp_force(),
+    jc.jaw_travel(),
+    jc.lumen_area(),
+    jc.mean_contact_pressure(),
+)
+MEASURES = (
+    *FEW,
+    jc.smooth_peak_circumferential_stress("media"),
+    jc.smooth_peak_principal_stress("adventitia"),
+    jc.axial_stress_at_P(),
+    jc.circumferential_stress_at_P(),
+    jc.lumen_height(),
+    jc.lumen_width(),
+    jc.smooth_peak_contact_pressure(),
+    jc.volume_above("media", 20.0),
+    jc.stored_energy(),
+    jc.physiological_lumen_radius(),
+)
+
+FAMILIES = {
+    "material": ("artery.layers[0].material", "artery.layers[1].material"),
+    "layers": (
+        "artery.layers[0].inner_radius",
+        "artery.layers[0].thickness",
+        "artery.layers[0].opening_angle",
+        "artery.layers[1].inner_radius",
+        "artery.layers[1].thickness",
+        "artery.layers[1].opening_angle",
+    ),
+    "load": ("artery.axial_stretch", "artery.pressure", "artery.length"),
+    "jaw": ("clamp.jaw",),
+    "contact": ("contact",),
+    "stop": ("stop",),
+    "mesh": ("mesh",),
+}
+
+JAW = '{shape="spline", half_width_mm=2.4, slopes=[0.15, 0.35, 0.6], edge_radius_mm=0.6}'
+STOPS = {
+    "occlusion": "stop={occlusion=0.925}",
+    "half closed": "stop={occlusion=0.5}",
+    "travel": "stop={travel_mm=1.8}",
+    "force": "stop={force_N=0.3}",
+}
+
+
+def tight(scene: jc.Scene) -> jc.Scene:
+    """Converged as far as float64 allows, so that differences are not noise."""
+    return dataclasses.replace(scene, solver=dataclasses.replace(scene.solver, tolerance=1e-12))
+
+
+@functools.cache
+def clamped(stop: str) -> jc.Result:
+    overrides = [
+        f"clamp.jaw={JAW}",
+        STOPS[stop],
+        "mesh.circumferential=4",
+        "mesh.axial=6",
+        "mesh.radial=[2, 1]",
+    ]
+    return jc.clamp(tight(jc.load_scene("human-lad", overrides)))
+
+
+def moved(scene: jc.Scene, direction: jc.Scene, h: float) -> jc.Scene:
+    return jax.tree_util.tree_map(lambda a, d: np.asarray(a) + h * np.asarray(d), scene, direction)
+
+
+def drawn(scene: jc.Scene, paths: tuple[str, ...], seed: int) -> jc.Scene:
+    """A random direction in the given parts of a scene, in proportion to the values; zero elsewhere."""
+    rng = np.random.default_rng(seed)
+    direction = jax.tree_util.tree_map(lambda a: np.zeros(np.shape(a)), scene)
+    for path in paths:
+        part = functools.reduce(step, path.split("."), scene)
+        random = jax.tree_util.tree_map(
+            lambda a: rng.uniform(-1.0, 1.0, np.shape(a)) * np.maximum(np.abs(a), 1e-3), part
+        )
+        direction = jc.replace(direction, path, random)
+    return direction
+
+
+def step(node, name: str):
+    head, _, index = name.partition("[")
+    return getattr(node, head)[int(index[:-1])] if index else getattr(node, head)
+
+
+@functools.cache
+def gradient_of(stop: str, measure: jc.Measure) -> tuple[float, jc.Scene]:
+    return jc.value_and_gradient(clamped(stop), measure)
+
+
+def dot(a: jc.Scene, b: jc.Scene) -> float:
+    pairs = zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True)
+    return float(sum(np.vdot(np.asarray(x), np.asarray(y)) for x, y in pairs))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_gradient_at_the_stop(family):
+    check_differences("occlusion", family, FEW)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_gradient_of_every_measure_at_every_stop(stop, family):
+    check_differences(stop, family, MEASURES)
+
+
+def check_differences(stop: str, family: str, measures: tuple[jc.Measure, ...]) -> None:
+    """The V-shaped curve: the error falls with h**2, then rises with rounding; its least is tiny.
+
+    Relative to the change that the direction makes, or, where that nearly vanishes, to a part of the value.
+    """
+    result = clamped(stop)
+    direction = drawn(result.scene, FAMILIES[family], seed=len(family))
+    exact = np.array([dot(gradient_of(stop, m)[1], direction) for m in measures])
+    values = np.array([gradient_of(stop, m)[0] for m in measures])
+    errors = []
+    for h in (1e-2, 1e-3, 1e-4, 1e-5):
+        both = [jc.clamp(moved(result.scene, direction, sign * h), guess=result) for sign in (1.0, -1.0)]
+        ahead, behind = ([r.measure(m) for m in measures] for r in both)
+        difference = (np.array(ahead) - np.array(behind)) / (2.0 * h)
+        errors.append(np.abs(difference - exact) / np.maximum(np.abs(exact), 1e-3 * np.abs(values)))
+    best = np.min(errors, axis=0)
+    for measure, error in zip(measures, best, strict=True):
+        assert error < 1e-6, f"{measure}: {error:.1e}"
+    moving = np.abs(exact) > 1e-3 * np.abs(values)
+    if family in ("material", "load"):  # the truncation error is seen: h has done something
+        assert np.max(np.array(errors)[0, moving]) > 10.0 * np.max(best[moving])
+
+
+def test_forward_and_reverse_agree():
+    result = clamped("occlusion")
+    direction = drawn(result.scene, ("artery", "clamp", "contact", "stop", "mesh"), 3)
+    measure = MEASURES[0]
+    f = lambda s: jc.evaluate(s, measure, guess=result)
+    value, slope = jax.jvp(f, (moved(result.scene, direction, 0.0),), (direction,))
+    again, gradient = jax.value_and_grad(f)(result.scene)
+    assert float(value) == pytest.approx(float(again), rel=1e-12)
+    assert float(slope) == pytest.approx(dot(gradient, direction), rel=1e-9)
+    assert dot(gradient, direction) == pytest.approx(
+        dot(gradient_of("occlusion", MEASURES[0])[1], direction), rel=1e-9
+    )
+
+
+def test_hessian_vector_product_and_jacobians():
+    """Derivatives of derivatives with respect to jaw and stop, against differences of gradients."""
+    result = clamped("occlusion")
+    measure, slopes = MEASURES[0], np.asarray(result.scene.clamp.jaw.slopes)
+
+    def f(v):
+        return jc.evaluate(jc.replace(result.scene, "clamp.jaw.slopes", v), measure, guess=result)
+
+    rng = np.random.default_rng(5)
+    d = rng.uniform(-1.0, 1.0, slopes.shape)
+    _, product = jax.jvp(jax.grad(f), (jnp.asarray(slopes),), (jnp.asarray(d),))
+    h = 1e-4
+    difference = (np.asarray(jax.grad(f)(slopes + h * d)) - np.asarray(jax.grad(f)(slopes - h * d))) / (2 * h)
+    np.testing.assert_allclose(product, difference, rtol=1e-4, atol=1e-4 * np.max(np.abs(difference)))
+    forward, reverse = jax.jacfwd(f)(jnp.asarray(slopes)), jax.jacrev(f)(jnp.asarray(slopes))
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    np.testing.assert_allclose(forward, gradient_of("occlusion", MEASURES[0])[1].clamp.jaw.slopes, rtol=1e-9)
+
+
+def test_inside_a_compiled_program():
+    """Under jit the scene is solved by another process; values and derivatives are the same."""
+    result = clamped("occlusion")
+    measure, slopes = MEASURES[0], np.asarray(result.scene.clamp.jaw.slopes)
+
+    @jax.jit
+    def compiled(v):
+        return jax.value_and_grad(
+            lambda w: jc.evaluate(jc.replace(result.scene, "clamp.jaw.slopes", w), measure)
+        )(v)
+
+    value, gradient = compiled(jnp.asarray(slopes))
+    assert float(value) == pytest.approx(gradient_of("occlusion", MEASURES[0])[0], rel=1e-8)
+    np.testing.assert_allclose(gradient, gradient_of("occlusion", MEASURES[0])[1].clamp.jaw.slopes, rtol=1e-6)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no equilibrium"):
+        jax.block_until_ready(
+            jax.jit(lambda q: jc.evaluate(jc.replace(result.scene, "artery.pressure", q), measure))(1e7)
+        )
+
+
+def test_no_equilibrium_no_derivative():
+    scene = jc.replace(clamped("occlusion").scene, "artery.pressure", 1e7)
+    with pytest.raises(jc.EquilibriumError):
+        jax.value_and_grad(jc.evaluate)(scene, MEASURES[0])
+
+
+def test_a_measure_of_the_body_does_not_clamp():
+    scene = clamped("occlusion").scene
+    impossible = jc.replace(scene, "stop.occlusion", 0.999999)
+    radius, gradient = jax.value_and_grad(jc.evaluate)(impossible, jc.physiological_lumen_radius())
+    assert float(radius) == pytest.approx(clamped("occlusion").measure(jc.physiological_lumen_radius()))
+    assert float(gradient.stop.occlusion) == 0.0
+    assert np.all(np.asarray(gradient.clamp.jaw.slopes) == 0.0)
+
+
+def test_an_old_equilibrium_is_not_mistaken_for_another():
+    """Tickets are not reused: derivatives of a solution that is no longer kept are refused."""
+    result = clamped("occlusion")
+    known = solution(result, to_stop=True)
+    ticket = register(known)
+    for _ in range(10):
+        register(known)
+    scene = jax.tree_util.tree_map(lambda a: jnp.asarray(a, float), result.scene)
+    parts = result.model.discretisation
+    f = lambda s: jc.clamp_force()(see(s, parts, implicit(s, parts, known.u, ticket)))
+    with pytest.raises(Exception, match="no longer kept"):
+        jax.block_until_ready(jax.grad(f)(scene))
+
+
+@pytest.mark.parametrize(
+    ("path", "of"),
+    [
+        ("artery.pressure", "pressure"),
+        ("artery.axial_stretch", "stretch"),
+        ("artery.layers[0].material.c", ("c", 0)),
+        ("artery.layers[1].material.k1", ("k1", 1)),
+        ("artery.layers[0].thickness", ("thickness", 0)),
+    ],
+)
+def test_tube_radius_against_the_differentiated_theory(path, of):
+    """d radius of the inflated tube, by the engine on a fine mesh and by the semi-analytic tube."""
+    scene = tube_scene(SEED, 13.33, 1.1, mesh("q2p1", 4, 1, (4, 3)))
+    _, gradient = jax.value_and_grad(jc.evaluate)(tight(scene), jc.physiological_lumen_radius())
+    found = functools.reduce(step, path.split("."), gradient)
+
+    def radius(change: float) -> float:
+        layers, loads = list(SEED), {"pressure": 13.33, "stretch": 1.1}
+        if isinstance(of, str):
+            loads[of] += change
+        else:
+            name, number = of
+            layers[number] = dataclasses.replace(
+                layers[number], **{name: getattr(layers[number], name) + change}
+            )
+        return Compressible(tuple(layers), loads["pressure"], loads["stretch"], 1e4).inner_radius
+
+    h = 1e-4
+    expected = (radius(h) - radius(-h)) / (2.0 * h)
+    assert float(found) == pytest.approx(expected, rel=5e-3)
+
+
+def test_smooth_quantities_are_smooth_where_the_true_peak_jumps():
+    """Over a range of occlusions the place of the true peak jumps; the smooth peak and its slope do not."""
+    result = clamped("occlusion")
+    measure = MEASURES[0]
+    levels = np.linspace(0.90, 0.93, 7)
+    smooth, slopes, last = [], [], result
+    for level in levels:
+        last = jc.clamp(jc.replace(result.scene, "stop.occlusion", level), guess=last)
+        value, gradient = jc.value_and_gradient(last, measure)
+        smooth.append(value)
+        slopes.append(float(gradient.stop.occlusion))
+    h = levels[1] - levels[0]
+    # Hermite: the mean of the slopes at both ends of an interval is its difference quotient to O(h**2)
+    quotients = np.diff(smooth) / h
+    means = 0.5 * (np.array(slopes[1:]) + np.array(slopes[:-1]))
+    np.testing.assert_allclose(quotients, means, rtol=2e-2)
