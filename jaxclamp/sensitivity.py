@@ -64,17 +64,24 @@ def positions(scene: Scene, parts: Discretisation, free: Array) -> Array:
 
 def equations(scene: Scene, parts: Discretisation, u: Unknowns) -> Unknowns:
     """Residuals of equilibrium and of the stop, mN and mm (mN for a force stop)."""
-    body, pressure = body_of(scene, parts), scene.artery.pressure
-    free = parts.topology.free
+    body, pressure, free = body_of(scene, parts), scene.artery.pressure, parts.topology.free
     assert u.physiological is not None
     x0 = positions(scene, parts, u.physiological)
     at_rest = artery_forces(body, x0, pressure).ravel()[free]
     if u.stop is None or u.jaw_height is None:
         return Unknowns(physiological=at_rest, stop=None, jaw_height=None)
-    x1 = positions(scene, parts, u.stop)
-    closed = artery_forces(body, x1, pressure).ravel()[free]
-    touch, closing = _jaw_equations(body, scene.stop, parts, x0, x1, u.jaw_height)
-    return Unknowns(physiological=at_rest, stop=closed + touch, jaw_height=closing)
+    stopped = stop_equations(scene, parts, u)
+    return dataclasses.replace(stopped, physiological=at_rest)
+
+
+def stop_equations(scene: Scene, parts: Discretisation, u: Unknowns) -> Unknowns:
+    """The same without the equilibrium in the body, which is held."""
+    body, pressure, free = body_of(scene, parts), scene.artery.pressure, parts.topology.free
+    assert u.stop is not None
+    closed = artery_forces(body, positions(scene, parts, u.stop), pressure).ravel()[free]
+    jaw = jaw_equations(scene, parts, u)
+    assert jaw.stop is not None
+    return dataclasses.replace(jaw, stop=closed + jaw.stop)
 
 
 @jax.jit
@@ -150,10 +157,13 @@ def _implicit_jvp(primals: Any, tangents: Any) -> tuple[Unknowns, Unknowns]:
 @jax.jit
 def _tangent(scene: Scene, parts: Discretisation, u: Unknowns, v: Unknowns) -> Unknowns:
     """dR/du v; where the artery in the body is held, without its equations."""
-    held = v.physiological is None
-    full = dataclasses.replace(v, physiological=jnp.zeros(parts.topology.free.shape)) if held else v
-    moved: Unknowns = jax.jvp(lambda w: equations(scene, parts, w), (u,), (full,))[1]
-    return dataclasses.replace(moved, physiological=None) if held else moved
+    if v.physiological is not None:
+        _, everywhere = jax.jvp(lambda w: equations(scene, parts, w), (u,), (v,))
+        return everywhere
+    held = lambda w: dataclasses.replace(w, physiological=u.physiological)  # noqa: E731
+    start = dataclasses.replace(u, physiological=None)
+    _, at_stop = jax.jvp(lambda w: stop_equations(scene, parts, held(w)), (start,), (v,))
+    return at_stop
 
 
 def _on_host(ticket: Array, b: Unknowns, transposed: bool) -> Unknowns:

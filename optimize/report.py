@@ -107,15 +107,16 @@ def _verification(study: Study) -> str:
         return "<p>Not done.</p>"
     layers = [layer.name for layer in study.best.scene.artery.layers]
     peak = "peak_axial_stress_kPa"
-    results = shown(study)
-    rows = []
-    for layer in layers:
-        for model, finals in (
-            ("study's model", {n: r.final for n, r in results.items()}),
-            ("finer", found.final),
-        ):
-            cells = [(finals[name] or {peak: {layer: None}})[peak][layer] for name in results]
-            rows.append([f"true peak axial stress, {layer}, {model} (kPa)", *map(number, cells)])
+    results = {name: result for name, result in shown(study).items() if name in found.final}
+    models = (("study's model", {n: r.final for n, r in results.items()}), ("finer", found.final))
+    rows = [
+        [
+            f"true peak axial stress, {layer}, {model} (kPa)",
+            *(number((finals[name] or {peak: {layer: None}})[peak][layer]) for name in results),
+        ]
+        for layer in layers
+        for model, finals in models
+    ]
     unit = study.problem.objective.unit
     rows.append([f"objective, study's model ({unit})", *(number(found.coarse[name]) for name in results)])
     rows.append([f"objective, finer ({unit})", *(number(found.fine[name]) for name in results)])

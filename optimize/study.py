@@ -462,13 +462,11 @@ def _finish(
     tell(Progress("verifying", 0.0, "start and best from scratch"))
     start = first or clamp(problem.scene)
     best, result = _found_cold(record, start)
-    named = {"start": start, "best": result}
-    if problem.reference is not None:
-        named["reference"] = clamp(problem.reference)
+    reference = None if problem.reference is None else clamp(problem.reference)
     verification = None
     if check_finer_mesh:
         tell(Progress("verifying", 0.3, "on a finer mesh, with stiffer and sharper contact"))
-        verification = verify(problem, named)
+        verification = verify(problem, {"start": start, "best": result})
     tell(Progress("verifying", 1.0, "" if verification is None else verification.sentence))
     return Study(
         problem=problem,
@@ -478,7 +476,7 @@ def _finish(
         start=start,
         best=result,
         best_design=best.design,
-        reference=named.get("reference"),
+        reference=reference,
         verification=verification,
         seconds=time.perf_counter() - begun,
     )

@@ -22,7 +22,7 @@ def finer(scene: Scene) -> Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Verification:
-    """Start, best (and reference) on the finer model; None where it has no equilibrium."""
+    """Start and best on the finer model; None where it has no equilibrium."""
 
     coarse: dict[str, float]
     """objective on the study's own model, internal units"""
@@ -69,7 +69,7 @@ class Verification:
 
 
 def verify(problem: DesignProblem, results: dict[str, Result]) -> Verification:
-    """Solve results ("start", "best" and perhaps more) from scratch on the finer model."""
+    """Solve the results "start" and "best" from scratch on the finer model."""
     fine: dict[str, float | None] = dict.fromkeys(results)
     final: dict[str, dict[str, Any] | None] = dict.fromkeys(results)
     failure, elements = None, 0

@@ -11,25 +11,23 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
+from jaxclamp.scene_file import loads_scene
 from jaxclamp.sensitivity import implicit, register, see, solution
-from tube import SEED, Compressible
+from tube import RING, Compressible
 from walks import mesh, tube_scene
 
-FEW = (
-    jc.smooth_peak_axial_stress("media"),
-    jc.clamp_force(),
-    jc.jaw_travel(),
-    jc.lumen_area(),
-    jc.mean_contact_pressure(),
-)
 MEASURES = (
-    *FEW,
+    jc.smooth_peak_axial_stress("media"),
     jc.smooth_peak_circumferential_stress("media"),
     jc.smooth_peak_principal_stress("adventitia"),
     jc.axial_stress_at_P(),
     jc.circumferential_stress_at_P(),
+    jc.clamp_force(),
+    jc.jaw_travel(),
     jc.lumen_height(),
     jc.lumen_width(),
+    jc.lumen_area(),
+    jc.mean_contact_pressure(),
     jc.smooth_peak_contact_pressure(),
     jc.volume_above("media", 20.0),
     jc.stored_energy(),
@@ -37,14 +35,11 @@ MEASURES = (
 )
 
 FAMILIES = {
-    "material": ("artery.layers[0].material", "artery.layers[1].material"),
-    "layers": (
-        "artery.layers[0].inner_radius",
-        "artery.layers[0].thickness",
-        "artery.layers[0].opening_angle",
-        "artery.layers[1].inner_radius",
-        "artery.layers[1].thickness",
-        "artery.layers[1].opening_angle",
+    "material": tuple(f"artery.layers[{i}].material" for i in (0, 1)),
+    "layers": tuple(
+        f"artery.layers[{i}].{name}"
+        for i in (0, 1)
+        for name in ("inner_radius", "thickness", "opening_angle")
     ),
     "load": ("artery.axial_stretch", "artery.pressure", "artery.length"),
     "jaw": ("clamp.jaw",),
@@ -69,6 +64,8 @@ def tight(scene: jc.Scene) -> jc.Scene:
 
 @functools.cache
 def clamped(stop: str) -> jc.Result:
+    if stop == "one layer":
+        return one_layer()
     overrides = [
         f"clamp.jaw={JAW}",
         STOPS[stop],
@@ -77,6 +74,16 @@ def clamped(stop: str) -> jc.Result:
         "mesh.radial=[2, 1]",
     ]
     return jc.clamp(tight(jc.load_scene("human-lad", overrides)))
+
+
+@functools.cache
+def one_layer() -> jc.Result:
+    """The media alone: one block of cells, so that programs which hold everything compile soon."""
+    counts = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[2]", "contact.smoothing_mm=0.05"]
+    scene = jc.load_scene("human-lad", [f"clamp.jaw={JAW}"])
+    artery = dataclasses.replace(scene.artery, layers=scene.artery.layers[:1])
+    text = jc.dump_scene(dataclasses.replace(scene, artery=artery, mesh=mesh("q1p0", 4, 6, (2,))))
+    return jc.clamp(tight(loads_scene(text, overrides=[*counts, STOPS["half closed"]])))
 
 
 def moved(scene: jc.Scene, direction: jc.Scene, h: float) -> jc.Scene:
@@ -112,8 +119,9 @@ def dot(a: jc.Scene, b: jc.Scene) -> float:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_gradient_at_the_stop(family):
-    check_differences("occlusion", family, FEW)
+def test_gradient_of_the_peak(family):
+    """One layer, one measure; the full set is slow because of what it compiles."""
+    check_differences("one layer", family, MEASURES[:1])
 
 
 @pytest.mark.slow
@@ -129,7 +137,9 @@ def check_differences(stop: str, family: str, measures: tuple[jc.Measure, ...]) 
     Relative to the change that the direction makes, or, where that nearly vanishes, to a part of the value.
     """
     result = clamped(stop)
-    direction = drawn(result.scene, FAMILIES[family], seed=len(family))
+    layers = len(result.scene.artery.layers)
+    paths = tuple(path for path in FAMILIES[family] if layers > 1 or "layers[1]" not in path)
+    direction = drawn(result.scene, paths, seed=len(family))
     exact = np.array([dot(gradient_of(stop, m)[1], direction) for m in measures])
     values = np.array([gradient_of(stop, m)[0] for m in measures])
     errors = []
@@ -142,12 +152,13 @@ def check_differences(stop: str, family: str, measures: tuple[jc.Measure, ...]) 
     for measure, error in zip(measures, best, strict=True):
         assert error < 1e-6, f"{measure}: {error:.1e}"
     moving = np.abs(exact) > 1e-3 * np.abs(values)
-    if family in ("material", "load"):  # the truncation error is seen: h has done something
+    if family == "load":  # the truncation error is seen: h has done something
         assert np.max(np.array(errors)[0, moving]) > 10.0 * np.max(best[moving])
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_agree():
-    result = clamped("occlusion")
+    result = one_layer()
     direction = drawn(result.scene, ("artery", "clamp", "contact", "stop", "mesh"), 3)
     measure = MEASURES[0]
     f = lambda s: jc.evaluate(s, measure, guess=result)
@@ -156,13 +167,14 @@ def test_forward_and_reverse_agree():
     assert float(value) == pytest.approx(float(again), rel=1e-12)
     assert float(slope) == pytest.approx(dot(gradient, direction), rel=1e-9)
     assert dot(gradient, direction) == pytest.approx(
-        dot(gradient_of("occlusion", MEASURES[0])[1], direction), rel=1e-9
+        dot(jc.value_and_gradient(result, MEASURES[0])[1], direction), rel=1e-9
     )
 
 
+@pytest.mark.slow
 def test_hessian_vector_product_and_jacobians():
     """Derivatives of derivatives with respect to jaw and stop, against differences of gradients."""
-    result = clamped("occlusion")
+    result = one_layer()
     measure, slopes = MEASURES[0], np.asarray(result.scene.clamp.jaw.slopes)
 
     def f(v):
@@ -176,12 +188,15 @@ def test_hessian_vector_product_and_jacobians():
     np.testing.assert_allclose(product, difference, rtol=1e-4, atol=1e-4 * np.max(np.abs(difference)))
     forward, reverse = jax.jacfwd(f)(jnp.asarray(slopes)), jax.jacrev(f)(jnp.asarray(slopes))
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)
-    np.testing.assert_allclose(forward, gradient_of("occlusion", MEASURES[0])[1].clamp.jaw.slopes, rtol=1e-9)
+    np.testing.assert_allclose(
+        forward, jc.value_and_gradient(result, MEASURES[0])[1].clamp.jaw.slopes, rtol=1e-9
+    )
 
 
+@pytest.mark.slow
 def test_inside_a_compiled_program():
     """Under jit the scene is solved by another process; values and derivatives are the same."""
-    result = clamped("occlusion")
+    result = one_layer()
     measure, slopes = MEASURES[0], np.asarray(result.scene.clamp.jaw.slopes)
 
     @jax.jit
@@ -191,8 +206,10 @@ def test_inside_a_compiled_program():
         )(v)
 
     value, gradient = compiled(jnp.asarray(slopes))
-    assert float(value) == pytest.approx(gradient_of("occlusion", MEASURES[0])[0], rel=1e-8)
-    np.testing.assert_allclose(gradient, gradient_of("occlusion", MEASURES[0])[1].clamp.jaw.slopes, rtol=1e-6)
+    assert float(value) == pytest.approx(jc.value_and_gradient(result, MEASURES[0])[0], rel=1e-8)
+    np.testing.assert_allclose(
+        gradient, jc.value_and_gradient(result, MEASURES[0])[1].clamp.jaw.slopes, rtol=1e-6
+    )
     with pytest.raises(jax.errors.JaxRuntimeError, match="no equilibrium"):
         jax.block_until_ready(
             jax.jit(lambda q: jc.evaluate(jc.replace(result.scene, "artery.pressure", q), measure))(1e7)
@@ -205,6 +222,7 @@ def test_no_equilibrium_no_derivative():
         jax.value_and_grad(jc.evaluate)(scene, MEASURES[0])
 
 
+@pytest.mark.slow
 def test_a_measure_of_the_body_does_not_clamp():
     scene = clamped("occlusion").scene
     impossible = jc.replace(scene, "stop.occlusion", 0.999999)
@@ -214,6 +232,7 @@ def test_a_measure_of_the_body_does_not_clamp():
     assert np.all(np.asarray(gradient.clamp.jaw.slopes) == 0.0)
 
 
+@pytest.mark.slow
 def test_an_old_equilibrium_is_not_mistaken_for_another():
     """Tickets are not reused: derivatives of a solution that is no longer kept are refused."""
     result = clamped("occlusion")
@@ -228,38 +247,37 @@ def test_an_old_equilibrium_is_not_mistaken_for_another():
         jax.block_until_ready(jax.grad(f)(scene))
 
 
-@pytest.mark.parametrize(
-    ("path", "of"),
-    [
-        ("artery.pressure", "pressure"),
-        ("artery.axial_stretch", "stretch"),
-        ("artery.layers[0].material.c", ("c", 0)),
-        ("artery.layers[1].material.k1", ("k1", 1)),
-        ("artery.layers[0].thickness", ("thickness", 0)),
-    ],
-)
-def test_tube_radius_against_the_differentiated_theory(path, of):
-    """d radius of the inflated tube, by the engine on a fine mesh and by the semi-analytic tube."""
-    scene = tube_scene(SEED, 13.33, 1.1, mesh("q2p1", 4, 1, (4, 3)))
+@pytest.mark.slow
+def test_tube_radius_against_the_differentiated_theory():
+    """The gradient of the inflated tube's radius, and differences of the semi-analytic radius."""
+    scene = tube_scene(RING, 13.33, 1.1, mesh("q2p1", 6, 1, (4,)))
     _, gradient = jax.value_and_grad(jc.evaluate)(tight(scene), jc.physiological_lumen_radius())
-    found = functools.reduce(step, path.split("."), gradient)
+    material, layer = gradient.artery.layers[0].material, gradient.artery.layers[0]
+    found = {
+        "pressure": gradient.artery.pressure,
+        "stretch": gradient.artery.axial_stretch,
+        "c": material.c,
+        "k1": material.k1,
+        "k2": material.k2,
+        "thickness": layer.thickness,
+        "inner_radius": layer.inner_radius,
+    }
+    for name, value in found.items():
 
-    def radius(change: float) -> float:
-        layers, loads = list(SEED), {"pressure": 13.33, "stretch": 1.1}
-        if isinstance(of, str):
-            loads[of] += change
-        else:
-            name, number = of
-            layers[number] = dataclasses.replace(
-                layers[number], **{name: getattr(layers[number], name) + change}
-            )
-        return Compressible(tuple(layers), loads["pressure"], loads["stretch"], 1e4).inner_radius
+        def radius(change: float, name: str = name) -> float:
+            ring, loads = RING[0], {"pressure": 13.33, "stretch": 1.1}
+            if name in loads:
+                loads[name] += change
+            else:
+                ring = dataclasses.replace(ring, **{name: getattr(ring, name) + change})
+            return Compressible((ring,), loads["pressure"], loads["stretch"], 1e4).inner_radius
 
-    h = 1e-4
-    expected = (radius(h) - radius(-h)) / (2.0 * h)
-    assert float(found) == pytest.approx(expected, rel=5e-3)
+        h = 1e-4
+        expected = (radius(h) - radius(-h)) / (2.0 * h)
+        assert float(value) == pytest.approx(expected, rel=1e-3), name
 
 
+@pytest.mark.slow
 def test_smooth_quantities_are_smooth_where_the_true_peak_jumps():
     """Over a range of occlusions the place of the true peak jumps; the smooth peak and its slope do not."""
     result = clamped("occlusion")
