@@ -1,4 +1,4 @@
-# `make test` checks everything; `make demo` clamps an artery. Needs Python 3.11 or newer, and make.
+# `make test` checks everything; `make demo` designs a jaw. Needs Python 3.11 or newer, and make.
 
 PYTHON ?= python3
 VENV := .venv
@@ -15,7 +15,7 @@ export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 
 help:
 	@echo "make test    lint, types and tests (creates $(VENV) on first use)"
-	@echo "make demo    clamp the human coronary artery of the examples, into $(OUT)/"
+	@echo "make demo    find the jaw that injures a human coronary artery least, into $(OUT)/ (minutes)"
 	@echo "make lint    lint, formatting and types only"
 	@echo "make slow    the tests that take more than a few seconds each"
 	@echo "make bench   timings"
@@ -44,10 +44,10 @@ bench: $(READY)
 	$(BIN)/pytest -m benchmark -s
 
 demo: $(READY)
-	$(BIN)/jaxclamp run human-lad --out $(OUT)
+	$(BIN)/jaxclamp optimise human-lad-jaw --out $(OUT) --resume
 	@echo
-	@echo "Open $(OUT)/report.html in a browser; the numbers are in $(OUT)/result.json and $(OUT)/history.csv."
-	@echo "Open the .pvd file in $(OUT)/ with ParaView to see the artery in 3-D."
+	@echo "Open $(OUT)/report.html in a browser; the numbers are in $(OUT)/study.json and $(OUT)/iterations.csv."
+	@echo "Open the .pvd file in $(OUT)/best/ with ParaView to see the artery in 3-D."
 
 clean:
 	rm -rf $(VENV) .cache .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist demo

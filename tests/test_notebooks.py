@@ -41,4 +41,6 @@ def test_notebook_runs(script, monkeypatch, tmp_path):
     assert outputs
     assert not [output for output in outputs if output.output_type == "error"]
     pictures = [output for output in outputs if "image/png" in output.get("data", {})]
-    assert len(pictures) == sum("result.plot_" in cell.source for cell in notebook.cells)
+    assert len(pictures) == sum(
+        cell.source.startswith("plot_") or "result.plot_" in cell.source for cell in notebook.cells
+    )
