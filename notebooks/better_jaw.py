@@ -23,7 +23,7 @@ import numpy as np
 import jaxclamp as jc
 from optimize import Constraint, DesignProblem, Variable, minimise
 
-COARSE = ["mesh.circumferential=5", "mesh.axial=10", "mesh.radial=[2, 1]", "stop.occlusion=0.8"]
+COARSE = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[2, 1]", "stop.occlusion=0.6"]
 JAW = 'clamp.jaw={shape="spline", half_width_mm=2.0, slopes=[0.3, 0.6, 0.9], edge_radius_mm=1.0}'
 scene = jc.load_scene("human-lad", [*COARSE, JAW])
 result = jc.clamp(scene)
@@ -74,7 +74,7 @@ for i in range(3):
 # than 1 mm, so that it can be machined.
 
 # %%
-study = minimise(problem, max_evaluations=12, check_finer_mesh=False)
+study = minimise(problem, max_evaluations=10, check_finer_mesh=False)
 print(study.stopped_because)
 for line in study.lines():
     print(line)

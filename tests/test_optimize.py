@@ -102,6 +102,7 @@ def test_values_and_gradients_of_a_design():
     np.testing.assert_allclose(first.gradients[:, 0], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-10)
 
 
+@pytest.mark.slow  # compiles the derivative of the whole scene into one program
 def test_artery_and_jaw_vary_together():
     problem = DesignProblem(
         scene(), PEAK, (Variable("clamp.jaw.radius", 1.0, 6.0), Variable("artery.pressure", 5.0, 20.0))
@@ -190,7 +191,10 @@ def scanned() -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("start", [0.1, 0.5, 1.2])
-@pytest.mark.parametrize("method", ["slsqp", "l-bfgs-b", "mma"])
+@pytest.mark.parametrize(
+    "method",
+    ["slsqp", pytest.param("l-bfgs-b", marks=pytest.mark.slow), pytest.param("mma", marks=pytest.mark.slow)],
+)
 def test_the_known_optimum_is_found(method, start):
     """The minimum that a fine scan locates, from three starts."""
     slope, value = scanned()
@@ -201,6 +205,7 @@ def test_the_known_optimum_is_found(method, start):
     assert study.best_design[0] == pytest.approx(slope, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_constraint_is_active_at_the_optimum():
     """A largest force below that of the free optimum: the best design uses all of it."""
     free = minimise(one_slope(), max_evaluations=20, check_finer_mesh=False)
