@@ -23,7 +23,7 @@ import numpy as np
 import jaxclamp as jc
 from optimize import Constraint, DesignProblem, Variable, minimise
 
-COARSE = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[2, 1]", "stop.occlusion=0.6"]
+COARSE = ["mesh.circumferential=6", "mesh.axial=16", "mesh.radial=[2, 1]", "stop.occlusion=0.9"]
 JAW = 'clamp.jaw={shape="spline", half_width_mm=2.0, slopes=[0.3, 0.6, 0.9], edge_radius_mm=1.0}'
 scene = jc.load_scene("human-lad", [*COARSE, JAW])
 result = jc.clamp(scene)

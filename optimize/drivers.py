@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 import scipy.optimize
 
@@ -128,7 +129,8 @@ def adam(target: Target) -> str:
     last = np.inf
     for _ in range(ADAM_STEPS):
         value, slope = target.objective(t)
-        step, state = rule.update(slope, state)
+        with jax.numpy_dtype_promotion("standard"):  # optax counts its steps in integers
+            step, state = rule.update(slope, state)
         moved = np.clip(t + np.asarray(step), 0.0, 1.0)
         still = float(np.max(np.abs(moved - t))) < 1e-4
         if still and abs(last - value) <= target.tolerance:

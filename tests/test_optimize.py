@@ -29,7 +29,7 @@ from optimize.study import other_starts
 from optimize.study_file import load_study
 from optimize.verification import finer
 
-SMALL = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[2, 1]", "stop.occlusion=0.6"]
+SMALL = ["mesh.circumferential=6", "mesh.axial=16", "mesh.radial=[2, 1]", "stop.occlusion=0.9"]
 PEAK = jc.smooth_peak_axial_stress("media")
 
 
@@ -39,8 +39,8 @@ def scene(*overrides: str) -> jc.Scene:
 
 def one_slope(start: float = 1.2) -> DesignProblem:
     """A jaw of one shape parameter: flat it cuts with its edges, steep with its middle."""
-    jaw = f'clamp.jaw={{shape="spline", half_width_mm=2.4, slopes=[{start}], edge_radius_mm=0.6}}'
-    return DesignProblem(scene(jaw), PEAK, (Variable("clamp.jaw.slopes", 0.0, 2.0),))
+    jaw = f'clamp.jaw={{shape="spline", half_width_mm=2.0, slopes=[{start}], edge_radius_mm=1.0}}'
+    return DesignProblem(scene(jaw), PEAK, (Variable("clamp.jaw.slopes", 0.0, 1.5),))
 
 
 # --- variables ----------------------------------------------------------------------------------
@@ -86,17 +86,14 @@ def test_a_design_is_put_into_the_scene():
 
 
 def test_values_and_gradients_of_a_design():
-    """Objective and constraints at once, against the general derivative and finite differences."""
+    """Objective and constraints at once, against finite differences."""
     problem = dataclasses.replace(
         one_slope(),
         constraints=(Constraint(jc.clamp_force(), upper=300.0), Constraint(jc.jaw_curvature(), upper=2.0)),
     )
     first, result = evaluate(problem, problem.start, None)
     assert first.failure is None
-    general = [jc.value_and_gradient(result, m) for m in problem.measures]
-    np.testing.assert_allclose(first.values, [v for v, _ in general], rtol=1e-12)
-    expected = [[float(g.clamp.jaw.slopes[0])] for _, g in general]
-    np.testing.assert_allclose(first.gradients, expected, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(first.values, [result.measure(m) for m in problem.measures], rtol=1e-9)
     h = 1e-4
     ahead, behind = (evaluate(problem, problem.start + s * h, result)[0].values for s in (1.0, -1.0))
     np.testing.assert_allclose(first.gradients[:, 0], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-10)
@@ -164,7 +161,7 @@ def test_drivers_end_when_it_is_enough(name):
 
     def objective(t):
         calls.append(t)
-        if len(calls) > 2:
+        if len(calls) > 1:
             raise Enough
         return float(t @ t), 2.0 * t
 
@@ -179,7 +176,7 @@ def test_drivers_end_when_it_is_enough(name):
 def scanned() -> tuple[float, float]:
     """Slope and objective of the best of a fine scan, by the parabola through its three lowest points."""
     problem, last = one_slope(), None
-    slopes = np.linspace(0.05, 1.25, 25)
+    slopes = np.array([*np.linspace(0.05, 0.2, 4), *np.linspace(0.22, 0.36, 8), *np.linspace(0.4, 1.2, 5)])
     values = []
     for slope in slopes:
         last = jc.clamp(problem.scene_at(np.array([slope])), guess=last)
@@ -190,7 +187,7 @@ def scanned() -> tuple[float, float]:
     return -b / (2 * a), c - b * b / (4 * a)
 
 
-@pytest.mark.parametrize("start", [0.1, 0.5, 1.2])
+@pytest.mark.parametrize("start", [0.1, 0.6, 1.2])
 @pytest.mark.parametrize(
     "method",
     ["slsqp", pytest.param("l-bfgs-b", marks=pytest.mark.slow), pytest.param("mma", marks=pytest.mark.slow)],
@@ -202,7 +199,7 @@ def test_the_known_optimum_is_found(method, start):
         one_slope(start), method=method, max_evaluations=25, tolerance=1e-6, check_finer_mesh=False
     )
     assert study.best.measure(PEAK) == pytest.approx(value, rel=2e-3)
-    assert study.best_design[0] == pytest.approx(slope, abs=0.05)
+    assert study.best_design[0] == pytest.approx(slope, abs=0.02)
 
 
 @pytest.mark.slow
@@ -253,12 +250,13 @@ def test_a_state_that_a_cold_solution_does_not_find_is_no_design(monkeypatch):
 
     def flattered(problem, design, near):
         found, result = measured(problem, design, near)
-        wrong = abs(design[0] - 0.5) < 0.05 and found.failure is None
+        wrong = abs(design[0] - 0.27) < 0.06 and found.failure is None
         return (dataclasses.replace(found, values=0.5 * found.values) if wrong else found), result
 
     monkeypatch.setattr(optimize.study, "evaluate", flattered)
     study = minimise(one_slope(), max_evaluations=12, check_finer_mesh=False)
-    lied = [e for e in study.evaluations if abs(e.design[0] - 0.5) < 0.05]
+    lied = [e for e in study.evaluations if abs(e.design[0] - 0.27) < 0.06]
+    assert lied
     assert not any(e.design is study.best_design for e in lied)
     assert all("from scratch" in e.failure for e in lied)
 
@@ -283,7 +281,7 @@ def test_several_starts(tmp_path):
 def test_the_finer_model_is_finer_and_harder():
     coarse = scene()
     fine = finer(coarse)
-    assert fine.mesh.axial == 9
+    assert fine.mesh.axial == 24
     assert float(fine.contact.stiffness) == 2.0 * float(coarse.contact.stiffness)
     assert float(fine.contact.smoothing) == 0.5 * float(coarse.contact.smoothing)
 
@@ -301,11 +299,11 @@ def test_bad_requests():
 STUDY = """
 title = "One slope"
 scene = "human-lad"
-set = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[2, 1]", "stop.occlusion=0.6"]
+set = ["mesh.circumferential=6", "mesh.axial=16", "mesh.radial=[2, 1]", "stop.occlusion=0.9"]
 max_evaluations = 12
 
 [start]
-jaw = { shape = "spline", half_width_mm = 2.4, slopes = [1.2], edge_radius_mm = 0.6 }
+jaw = { shape = "spline", half_width_mm = 2.0, slopes = [1.2], edge_radius_mm = 1.0 }
 
 [objective]
 measure = "smooth_peak_axial_stress_kPa"
