@@ -187,7 +187,7 @@ def scanned() -> tuple[float, float]:
     return -b / (2 * a), c - b * b / (4 * a)
 
 
-@pytest.mark.parametrize("start", [0.1, 0.6, 1.2])
+@pytest.mark.parametrize("start", [*(pytest.param(s, marks=pytest.mark.slow) for s in (0.1, 0.6)), 1.2])
 @pytest.mark.parametrize(
     "method",
     ["slsqp", pytest.param("l-bfgs-b", marks=pytest.mark.slow), pytest.param("mma", marks=pytest.mark.slow)],
