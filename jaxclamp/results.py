@@ -78,9 +78,19 @@ class Result:
     linear_solvers: LinearSolvers = dataclasses.field(repr=False)
 
     def measure(self, measure: Measure) -> float:
-        """The value of a measure in internal units (mm, kPa, mN, uJ), from the states at hand."""
-        assert self.physiological is not None, "the artery has not reached its physiological state"
+        """The value of a measure in internal units (mm, kPa, mN, uJ), from the states at hand.
+
+        Raises EquilibriumError if the stop was not reached, ValueError if it was not asked for.
+        """
+        self.require(measure.needs_stop)
         return float(measure(self.seen))
+
+    def require(self, to_stop: bool) -> None:
+        """Raise EquilibriumError or ValueError unless there is something to measure or differentiate."""
+        if self.failure is not None:
+            raise self.failure
+        if to_stop and self.states[-1].stage != "clamping":
+            raise ValueError("this result is of the artery without its clamp: use jaxclamp.clamp")
 
     @property
     def seen(self) -> Seen:

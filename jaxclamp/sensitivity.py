@@ -193,7 +193,8 @@ class Solution:
 
 
 def solution(result: Result, to_stop: bool) -> Solution:
-    """The solution that a result holds."""
+    """The solution that a result holds. Raises its EquilibriumError if it did not reach the stop."""
+    result.require(to_stop)
     free = np.asarray(result.model.discretisation.topology.free)
     assert result.physiological is not None
     base, last = result.physiological.equilibrium, result.states[-1].equilibrium

@@ -324,3 +324,16 @@ def test_the_inner_walls_meet_and_carry_load(occlusion):
     open_states = [record for record in result.history if record["lumen_overlap_mm"] <= 0.0]
     assert all(record["lumen_contact_force_N"] == 0.0 for record in open_states)
     assert len(open_states) >= 3
+
+
+def test_nothing_is_measured_or_differentiated_short_of_the_stop():
+    """The states that did converge are kept, but they are not at the stop."""
+    counts = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[2, 1]"]
+    with pytest.raises(jc.EquilibriumError) as caught:
+        jc.clamp(jc.load_scene("human-lad", [*counts, "stop={force_N=900}"]))
+    partial = caught.value.result
+    assert partial.states[-1].stage == "clamping"
+    with pytest.raises(jc.EquilibriumError):
+        partial.measure(jc.clamp_force())
+    with pytest.raises(jc.EquilibriumError):
+        jc.value_and_gradient(partial, jc.clamp_force())
