@@ -35,7 +35,7 @@ from jaxclamp.energies import (
 from jaxclamp.materials import Material
 from jaxclamp.meshes import Mesh
 from jaxclamp.pytree import record, static
-from jaxclamp.tensors import Tensor, det, pointwise_derivatives, total
+from jaxclamp.tensors import Tensor, components, det, pointwise_derivatives, stacked, total
 
 PAIRS = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
 
@@ -43,14 +43,14 @@ AnyArray = Array | np.ndarray
 Density = Callable[[Tensor], Array]
 
 
-def at_points(stencil: AnyArray, x: Array) -> Array:
-    """y_c = sum_a S[q, c, a] x_a at every point: (n_c, 3, n_q, n_cells).
+def at_points(stencil: AnyArray, x: Array) -> dict[tuple[int, int], Array]:
+    """y_c = sum_a S[q, c, a] x_a at every point, by components [c, i]: each (n_q, n_cells).
 
     stencil: (n_q, n_c, n_en); x: positions of the cells' nodes, (n_en, 3, n_cells)
     """
     n_q, n_c, n_en = stencil.shape
     y = jnp.matmul(jnp.reshape(stencil, (n_q * n_c, n_en)), x.reshape(n_en, -1))
-    return jnp.moveaxis(y.reshape(n_q, n_c, 3, -1), 0, 2)
+    return components(jnp.moveaxis(y.reshape(n_q, n_c, 3, -1), 0, 2))
 
 
 def to_nodes(stencil: AnyArray, dy: Array) -> Array:
@@ -75,12 +75,11 @@ def cell_derivatives(density: Density, stencil: AnyArray, x: Array) -> tuple[Arr
     """Energy at the points (n_q, n_cells), cell vectors (n_en, 3, n_cells), cell matrices."""
     n_c = stencil.shape[1]
     y = at_points(stencil, x)
-    keys = [(c, i) for c in range(n_c) for i in range(3)]
-    of_components = lambda v: density(dict(zip(keys, v, strict=True)))  # noqa: E731
-    value, first, second = pointwise_derivatives(of_components, [y[key] for key in keys])
-    moduli = second.reshape(n_c, 3, n_c, 3, *y.shape[2:])
+    of_components = lambda v: density(dict(zip(y, v, strict=True)))  # noqa: E731
+    value, first, second = pointwise_derivatives(of_components, list(y.values()))
+    moduli = second.reshape(n_c, 3, n_c, 3, *value.shape)
     six = jnp.stack([moduli[:, i, :, j] for i, j in PAIRS], axis=2)
-    return value, to_nodes(stencil, first.reshape(y.shape)), to_matrices(stencil, six)
+    return value, to_nodes(stencil, first.reshape(n_c, 3, *value.shape)), to_matrices(stencil, six)
 
 
 @record
@@ -257,7 +256,7 @@ def _intima(body: Body, plane: Array | float = 0.0) -> Density:
     return lambda y: intima_density(y, plane, body.parameters.contact, body.geometry.dA_inner)
 
 
-def _dilatation(stencils: Stencils, geometry: Geometry, dx_dxi: Array) -> Array:
+def _dilatation(stencils: Stencils, geometry: Geometry, dx_dxi: Tensor) -> Array:
     """int N_m (J - 1) dV of every cell, mm^3, (n_m, n_cells)."""
     density = dilatation_density(dx_dxi, geometry.to_local, geometry.dV)
     return jnp.einsum("mq,qc->mc", stencils.modes, density)
@@ -284,7 +283,7 @@ def stored_energy(body: Body, x: Array) -> Array:
     wall = total(
         jnp.sum(
             wall_density(
-                dx_dxi[..., first:last],
+                {key: values[:, first:last] for key, values in dx_dxi.items()},
                 body.geometry.to_local[..., first:last],
                 body.geometry.dV[:, first:last],
                 material,
@@ -377,7 +376,7 @@ def linearise_block(piece: Piece, stencils: Stencils, material: Material) -> Blo
     dx_dxi = at_points(stencils.wall, x)
     dilatation = _dilatation(stencils, g, dx_dxi)
     missing = _condensed_pressure(g, dilatation) - p
-    slope = jax.grad(lambda y: jnp.sum(dilatation_density(y, g.to_local, g.dV)))(dx_dxi)
+    slope = stacked(jax.grad(lambda y: jnp.sum(dilatation_density(y, g.to_local, g.dV)))(dx_dxi))
     modes = [to_nodes(stencils.wall, slope * mode[:, None]) for mode in stencils.modes]
     stiff_modes = [
         total(g.pressure_stiffness[m, n] * mode for n, mode in enumerate(modes)) for m in range(len(modes))
@@ -409,20 +408,13 @@ def piece_force(piece: Piece, stencils: Stencils, material: Material) -> Array:
     """
     g = piece.geometry
     y = at_points(stencils.wall, piece.x)
-    keys = [(c, i) for c in range(3) for i in range(3)]
-    components = [y[key] for key in keys]
-    dilated = lambda v: dilatation_density(dict(zip(keys, v, strict=True)), g.to_local, g.dV)  # noqa: E731
-    pressures = _condensed_pressure(g, jnp.einsum("mq,qc->mc", stencils.modes, dilated(components)))
+    dilated = lambda v: dilatation_density(v, g.to_local, g.dV)  # noqa: E731
+    pressures = _condensed_pressure(g, jnp.einsum("mq,qc->mc", stencils.modes, dilated(y)))
     p = jnp.einsum("mq,mc->qc", stencils.modes, pressures)
-
-    def shape_energy(v: list[Array]) -> Array:
-        return jnp.sum(
-            wall_density(dict(zip(keys, v, strict=True)), g.to_local, g.dV, material, jnp.zeros(()))
-        )
-
-    volume = jax.vjp(dilated, components)[1](p)[0]
-    stress = [a + b for a, b in zip(jax.grad(shape_energy)(components), volume, strict=True)]
-    return to_nodes(stencils.wall, jnp.stack(stress).reshape(y.shape))
+    shape_energy = lambda v: jnp.sum(wall_density(v, g.to_local, g.dV, material, jnp.zeros(())))  # noqa: E731
+    volume = jax.vjp(dilated, y)[1](p)[0]
+    stress = jax.tree_util.tree_map(jnp.add, jax.grad(shape_energy)(y), volume)
+    return to_nodes(stencils.wall, stacked(stress))
 
 
 def artery_forces(body: Body, x: Array, pressure: Array) -> Array:
@@ -527,4 +519,4 @@ def with_equilibrium_pressure(body: Body, x: Array, jaw_height: Array) -> State:
 def gaps(body: Body, state: State) -> Array:
     """Gap at the contact points, mm, (n_cq, n_facets)."""
     y = at_points(body.stencils.contact, _gather(state.x, body.topology.outer_facets))
-    return jaw_gap(y[0], state.jaw_height, body.parameters.jaw)
+    return jaw_gap([y[0, i] for i in range(3)], state.jaw_height, body.parameters.jaw)

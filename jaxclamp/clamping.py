@@ -7,6 +7,7 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -32,11 +33,12 @@ from jaxclamp.equilibrium import (
 )
 from jaxclamp.inflation import inflated_positions, inflated_radius
 from jaxclamp.linear_solvers import LinearSolver
-from jaxclamp.measures import PARTS_OF_A_JAW, observe
+from jaxclamp.measures import PARTS_OF_A_JAW, Report, observe
 from jaxclamp.meshes import closed_positions
 from jaxclamp.model import Model, build_model, same_kind
 from jaxclamp.results import Kept, LinearSolvers, Result, work_balance
 from jaxclamp.scene import ForceStop, OcclusionStop, Scene, TravelStop
+from jaxclamp.scene_file import require_possible
 
 FIRST_TOUCH = 0.02
 """the first closing step, as part of the outer radius: enough to bring points into contact"""
@@ -90,9 +92,9 @@ class _Walk:
 
     def keep(self, stage: str, equilibrium: Equilibrium, fraction: float, message: str) -> None:
         """Read a converged state off, remember it, and report progress."""
-        values = _to_floats(
-            observe(self.model.body, equilibrium.state, jnp.asarray(equilibrium.pressure), self.model.marks)
-        )
+        marks = self.model.marks
+        seen = observe(self.model.body, equilibrium.state, jnp.asarray(equilibrium.pressure), marks)
+        values = _to_floats(seen, marks.layer_names)
         if stage == "clamping":
             self.check(values)
         self.states.append(Kept(stage, equilibrium, values))
@@ -327,9 +329,11 @@ _ADVICE = {
 }
 
 
-def _to_floats(values: Any) -> Any:
-    """Host floats (lists for vectors) of a nested dict of arrays."""
-    return jax.tree_util.tree_map(lambda leaf: np.asarray(leaf).tolist(), jax.device_get(values))
+def _to_floats(report: Report, layer_names: tuple[str, ...]) -> Report:
+    """Host floats (lists for vectors), those of the layers from inside to outside."""
+    floats: Report = jax.tree_util.tree_map(lambda leaf: np.asarray(leaf).tolist(), jax.device_get(report))
+    in_order = lambda v: {name: v[name] for name in layer_names} if isinstance(v, dict) else v  # noqa: E731
+    return {key: in_order(value) for key, value in floats.items()}
 
 
 def _reporter(progress: bool | Callable[[Progress], Any] | None) -> Callable[[Progress], Any]:
@@ -352,6 +356,7 @@ def clamp(
     progress: True for lines on standard error, or a function of `Progress`
 
     Raises EquilibriumError if the stop is not reached; its `result` keeps what did converge.
+    Raises SceneError for a scene that no scene file could hold.
     """
     return _clamp(scene, guess, progress, to_stop=True)
 
@@ -359,7 +364,7 @@ def clamp(
 def inflate(scene: Scene, *, guess: Result | None = None) -> Result:
     """The artery of a scene in the body: load-free and physiological states, no clamp.
 
-    Raises EquilibriumError.
+    Raises EquilibriumError, and SceneError for a scene that no scene file could hold.
     """
     return _clamp(scene, guess, None, to_stop=False)
 
@@ -371,6 +376,7 @@ def _clamp(
     to_stop: bool,
 ) -> Result:
     start = time.perf_counter()
+    require_possible(scene)
     model = build_model(scene, None if guess is None else guess.model)
     neighbour = guess is not None and guess.converged and same_kind(scene, guess.scene)
     warm = guess if neighbour else None
@@ -476,6 +482,12 @@ def _closing_at_stop(walk: _Walk, near: Equilibrium) -> Held | LumenHeight | Jaw
 
 def _peak_memory_MB() -> float | None:
     """Largest memory of this process so far, MB; None where the system does not tell."""
+    try:
+        # Linux: getrusage would count what the process that started this one held
+        status = Path("/proc/self/status").read_text()
+        return float(status.split("VmHWM:")[1].split()[0]) / 1024.0
+    except (OSError, IndexError):
+        pass
     try:
         import resource
     except ImportError:  # Windows

@@ -27,7 +27,18 @@ from jaxclamp.materials import Material
 from jaxclamp.meshes import Mesh, stress_free_positions
 from jaxclamp.pytree import record
 from jaxclamp.scene import Artery, MeshSettings
-from jaxclamp.tensors import Tensor, Vector, cross, det, inverse, norm, product, stacked, transpose
+from jaxclamp.tensors import (
+    Tensor,
+    Vector,
+    components,
+    cross,
+    det,
+    inverse,
+    norm,
+    product,
+    stacked,
+    transpose,
+)
 
 
 @record
@@ -91,8 +102,8 @@ def build_geometry(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Geomet
     points, weights = element.quadrature()
     N, dN = element.shape(points)
     X = stress_free_positions(mesh, settings, artery)
-    axes = jnp.moveaxis(_cylindrical_axes(jnp.einsum("qa,iac->iqc", N, X)), 0, 1)  # columns
-    jacobian = jnp.einsum("qka,iac->ikqc", dN, X)
+    axes = transpose(_cylindrical_axes(jnp.einsum("qa,iac->iqc", N, X)))
+    jacobian = components(jnp.einsum("qka,iac->ikqc", dN, X))
     dV = det(jacobian) * weights[:, None]
     bulk = jnp.concatenate(
         [
@@ -122,12 +133,12 @@ def build_geometry(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Geomet
     )
 
 
-def _cylindrical_axes(X: Array) -> Array:
-    """Unit vectors (radial, circumferential, axial) at X (3, *batch), as rows: (3, 3, *batch)."""
+def _cylindrical_axes(X: Array) -> Tensor:
+    """Unit vectors (radial, circumferential, axial) at X (3, *batch), as rows."""
     length, zero = norm((X[0], X[1])), jnp.zeros_like(X[0])
     cosine, sine = X[0] / length, X[1] / length
     rows = [(cosine, sine, zero), (-sine, cosine, zero), (zero, zero, zero + 1.0)]
-    return jnp.stack([jnp.stack(row) for row in rows])
+    return {(i, j): component for i, row in enumerate(rows) for j, component in enumerate(row)}
 
 
 def wall_density(dx_dxi: Tensor, to_local: Tensor, dV: Array, material: Material, p: Array) -> Array:

@@ -44,7 +44,6 @@ from jaxclamp.tensors import (
     norm,
     product,
     smooth_maximum,
-    stacked,
     total,
     transpose,
 )
@@ -113,8 +112,8 @@ def find_landmarks(mesh: Mesh, layer_names: tuple[str, ...]) -> Landmarks:
 
 def cauchy_stress(
     piece: Piece, modes: AnyArray, gradients: AnyArray, material: Material
-) -> tuple[Tensor, Array]:
-    """Deformation gradient by components, and Cauchy stress (3, 3, n_q, n_cells) in kPa, Eqs. (7) to (9).
+) -> tuple[Tensor, Tensor]:
+    """Deformation gradient and Cauchy stress (kPa) by components, each (n_q, n_cells), Eqs. (7) to (9).
 
     sigma = p I + (1/J) d psi_bar/dF F', with the pressure of the cell.
     modes: (n_m, n_q); gradients: dN/dxi, (n_q, 3, n_en); F has its columns along the material axes
@@ -122,10 +121,12 @@ def cauchy_stress(
     F = product(transpose(at_points(gradients, piece.x)), piece.geometry.to_local)
     P = jax.grad(lambda G: jnp.sum(material.psi_bar(G)))(F)
     p = jnp.einsum("mq,mc->qc", modes, piece.p)
-    return F, stacked(product(P, transpose(F))) / det(F) + p * jnp.eye(3)[:, :, None, None]
+    J = det(F)
+    tau = product(P, transpose(F))
+    return F, {(i, j): tau[i, j] / J + p if i == j else tau[i, j] / J for i, j in tau}
 
 
-def along(F: Tensor, sigma: Array, axis: int) -> Array:
+def along(F: Tensor, sigma: Tensor, axis: int) -> Array:
     """Normal stress along the deformed image of a material axis (0 radial, 1 circumferential), kPa."""
     t = [F[i, axis] for i in range(3)]
     squared_length = total(component * component for component in t)
@@ -317,5 +318,6 @@ def _lifting(body: Body, state: State) -> Array:
     n = round(body.stencils.lumen.shape[0] ** 0.5)
     weights = tensor_rule((n, n))[1][:, None]
     y = at_points(body.stencils.lumen, jnp.swapaxes(state.x[facets], 1, 2))
-    at_corners = body.stencils.lumen[:, 0].T @ (cross(y[1], y[2])[1] * weights)
+    normal = cross([y[1, i] for i in range(3)], [y[2, i] for i in range(3)])
+    at_corners = body.stencils.lumen[:, 0].T @ (normal[1] * weights)
     return jnp.zeros(state.x.shape[0]).at[facets].add(at_corners)

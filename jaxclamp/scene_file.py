@@ -21,7 +21,16 @@ from jaxclamp.scene import Artery, MeshSettings, Scene, Stop
 from jaxclamp.scene_checks import check
 from jaxclamp.schema import BadKey, refuse
 
-__all__ = ["FIDELITIES", "SceneError", "dump_scene", "load_scene", "loads_scene", "mesh_for", "own_mesh_keys"]
+__all__ = [
+    "FIDELITIES",
+    "SceneError",
+    "dump_scene",
+    "load_scene",
+    "loads_scene",
+    "mesh_for",
+    "own_mesh_keys",
+    "require_possible",
+]
 
 # fidelity -> elements over the quarter circumference, over the half length, through the wall
 FIDELITIES = {"draft": (8, 10, 5), "standard": (10, 15, 8), "reference": (20, 30, 16)}
@@ -66,6 +75,17 @@ def dump_scene(scene: Scene) -> str:
     lines: list[str] = []
     _emit(schema.table(scene), "", lines)
     return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def require_possible(scene: Scene) -> None:
+    """Refuse a scene made in Python for what a file with its values would be refused for.
+
+    Raises SceneError.
+    """
+    try:
+        check(schema.read(Scene, schema.table(scene)))
+    except BadKey as error:
+        raise SceneError(f"scene: {error}") from None
 
 
 def mesh_for(fidelity: str, artery: Artery) -> MeshSettings:

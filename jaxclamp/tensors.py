@@ -24,6 +24,17 @@ Vector = Array | Sequence[Array]
 LARGEST_EXPONENT = 680.0
 
 
+def components(A: Array) -> dict[tuple[int, int], Array]:
+    """The components of A (n, m, *batch) as arrays of their own.
+
+    Differentiated backwards, this joins nine arrays; indexing A would add up nine arrays that are
+    zero in eight of nine places, each computed anew: ten times slower.
+    """
+    n, m = A.shape[:2]
+    parts = lax.split(A.reshape(n * m, *A.shape[2:]), [1] * (n * m))
+    return {(i, j): parts[m * i + j][0] for i in range(n) for j in range(m)}
+
+
 def total(terms: Iterable[Array]) -> Array:
     """The sum of one or more arrays."""
     return functools.reduce(operator.add, terms)

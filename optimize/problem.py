@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxclamp import EquilibriumError, Result, Scene, SceneError, clamp, dump_scene
+from jaxclamp import EquilibriumError, Result, Scene, SceneError, clamp
 from jaxclamp.model import Discretisation
 from jaxclamp.objectives import Measure
-from jaxclamp.scene_file import loads_scene
+from jaxclamp.scene_file import require_possible
 from jaxclamp.sensitivity import Unknowns, implicit, register, see, solution
 from optimize.parameters import Entry, Variable, entries, resolve, with_design
 
@@ -140,13 +140,13 @@ def _design_of(problem: DesignProblem, scene: Scene) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def why_impossible(scene: Scene) -> str | None:
-    """What a scene file with these values would be refused for; None if it would not."""
+def is_possible(scene: Scene) -> bool:
+    """True unless a scene file with these values would be refused."""
     try:
-        loads_scene(dump_scene(scene), "design")
-    except SceneError as error:
-        return str(error)
-    return None
+        require_possible(scene)
+    except SceneError:
+        return False
+    return True
 
 
 def evaluate(
@@ -155,15 +155,11 @@ def evaluate(
     """Solve a design, from a neighbour's solution if there is one. A failure is an answer, no error."""
     design = np.asarray(design, float)
     scene = problem.scene_at(design)
-    failure, result = why_impossible(scene), None
-    if failure is None:
-        try:
-            result = clamp(scene, guess=near)
-        except EquilibriumError as error:
-            failure = str(error)
-    if result is None:
+    try:
+        result = clamp(scene, guess=near)
+    except (EquilibriumError, SceneError) as error:
         n = len(problem.measures)
         nothing = np.full(n, math.nan), np.full((n, design.size), math.nan)
-        return Evaluation(design, *nothing, newton_iterations=0, failure=failure), None
+        return Evaluation(design, *nothing, newton_iterations=0, failure=str(error)), None
     values, slopes = gradients(problem, result)
     return Evaluation(design, values, slopes, result.solver["newton_iterations"]), result

@@ -26,7 +26,7 @@ from jaxclamp.linear_solvers import cores
 from jaxclamp.results import versions
 from optimize.drivers import METHODS, Enough, Target
 from optimize.journal import Journal
-from optimize.problem import DesignProblem, Evaluation, evaluate, why_impossible
+from optimize.problem import DesignProblem, Evaluation, evaluate, is_possible
 from optimize.verification import Verification, verify
 
 FEASIBLE = 1e-3
@@ -417,7 +417,7 @@ def other_starts(problem: DesignProblem, count: int) -> list[np.ndarray]:
         for t in draws.random(8):
             # half way to the start: the box's corners are seldom sensible
             design = 0.5 * (problem.start + lower + t * (upper - lower))
-            if why_impossible(problem.scene_at(design)) is None:
+            if is_possible(problem.scene_at(design)):
                 found.append(design)
         if len(found) >= count:
             break

@@ -33,7 +33,7 @@ MESHES = {"10x15x8": (10, 15, (5, 3)), "20x30x16": (20, 30, (10, 6))}
 REPEATS = 20
 
 IN_A_NEW_PROCESS = """
-import json, resource, time
+import json, time
 start = time.perf_counter()
 import jaxclamp as jc
 imported = time.perf_counter()
@@ -43,7 +43,7 @@ again = jc.clamp(jc.load_scene("human-lad"))
 second = time.perf_counter()
 print(json.dumps({
     "import": imported - start, "first": first - imported, "second": second - first,
-    "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "solver": again.solver,
+    "memory": again.cost["peak_memory_MB"], "solver": again.solver,
     "cost": again.cost,
 }))
 """
