@@ -7,7 +7,6 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -484,8 +483,8 @@ def _peak_memory_MB() -> float | None:
     """Largest memory of this process so far, MB; None where the system does not tell."""
     try:
         # Linux: getrusage would count what the process that started this one held
-        status = Path("/proc/self/status").read_text()
-        return float(status.split("VmHWM:")[1].split()[0]) / 1024.0
+        with open("/proc/self/status") as file:
+            return float(file.read().split("VmHWM:")[1].split()[0]) / 1024.0
     except (OSError, IndexError):
         pass
     try:
