@@ -401,39 +401,12 @@ def linearise_block(piece: Piece, stencils: Stencils, material: Material) -> Blo
 
 
 @jax.jit
-def piece_force(piece: Piece, stencils: Stencils, material: Material) -> Array:
-    """d Psi/dx of the cells' nodes with the pressures at their best, mN, (n_en, 3, n_cells).
-
-    What `linearise_block` gives as force at equilibrium, without the tangent: cheap to differentiate.
-    """
-    g = piece.geometry
-    y = at_points(stencils.wall, piece.x)
-    dilated = lambda v: dilatation_density(v, g.to_local, g.dV)  # noqa: E731
-    pressures = _condensed_pressure(g, jnp.einsum("mq,qc->mc", stencils.modes, dilated(y)))
-    p = jnp.einsum("mq,mc->qc", stencils.modes, pressures)
-    shape_energy = lambda v: jnp.sum(wall_density(v, g.to_local, g.dV, material, jnp.zeros(())))  # noqa: E731
-    volume = jax.vjp(dilated, y)[1](p)[0]
-    stress = jax.tree_util.tree_map(jnp.add, jax.grad(shape_energy)(y), volume)
-    return to_nodes(stencils.wall, stacked(stress))
-
-
 def artery_forces(body: Body, x: Array, pressure: Array) -> Array:
-    """d Pi/dx of wall and blood without contact, mN, (n_nodes, 3); several programs, as in `linearise`."""
-    n_m = body.geometry.pressure_stiffness.shape[0]
-    state = State(x=x, p=jnp.zeros((n_m, body.topology.cells.shape[1])), jaw_height=jnp.zeros(()))
-    blocks = [
-        piece_force(cells, body.stencils, body.parameters.materials[layer])
-        for cells, (layer, _, _) in zip(cut(body, state), body.topology.blocks, strict=True)
-    ]
-    return _summed_forces(body, x, pressure, blocks)
-
-
-@jax.jit
-def _summed_forces(body: Body, x: Array, pressure: Array, blocks: list[Array]) -> Array:
-    force = -pressure * jax.grad(lumen_volume, argnums=1)(body, x)
-    for (_, first, last), block in zip(body.topology.blocks, blocks, strict=True):
-        force = force + _scatter(body.topology.cells[:, first:last], block, x.shape[0])
-    return force
+    """d Pi/dx of wall and blood without contact, mN, (n_nodes, 3): what `linearise` gives without the
+    tangent, in one program that is cheap to differentiate."""
+    artery = lambda y: stored_energy(body, y) - pressure * lumen_volume(body, y)  # noqa: E731
+    forces: Array = jax.grad(artery)(x)
+    return forces
 
 
 @jax.jit

@@ -77,7 +77,7 @@ def body_of(scene: Scene, discretisation: Discretisation) -> Body:
         topology=discretisation.topology,
         stencils=discretisation.stencils,
         geometry=build_geometry(discretisation.mesh, scene.mesh, scene.artery),
-        parameters=jax.tree_util.tree_map(jnp.asarray, parameters),
+        parameters=parameters,
     )
 
 
@@ -90,7 +90,9 @@ def build_model(scene: Scene, like: Model | None = None) -> Model:
         discretisation, pattern = like.discretisation, like.pattern
     else:
         discretisation, pattern = discretise(scene)
-    return Model(scene, discretisation, pattern, body_of(scene, discretisation))
+    # float64 arrays, as in derivatives: Python's floats would make JAX compile everything once more
+    floats = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, jnp.float64), scene)
+    return Model(scene, discretisation, pattern, body_of(floats, discretisation))
 
 
 def same_kind(a: Scene, b: Scene) -> bool:
