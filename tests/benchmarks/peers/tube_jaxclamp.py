@@ -117,7 +117,7 @@ def main() -> None:
     """Measure and print."""
     import_s, import_memory = work.process_age(), work.peak_memory()
     args = work.arguments("jaxclamp")
-    repeats = 3 if np.prod(args.counts) <= work.SMALL else 1
+    repeats = 5 if np.prod(args.counts) <= work.SMALL else 1
     scene = tube_scene(args.counts, REACTIONS_SHARE)
     results, first = work.timed(lambda: inflate(scene))
     found: dict[str, Any] = {
