@@ -59,10 +59,13 @@ def run(name: str, python: str, mesh: str, options: list[str], cache: str | None
     return json.loads(lines[-1])
 
 
-def measure(name: str, python: str, mesh: str, seconds: float) -> Row:
-    """Everything about one code on one mesh."""
+def measure(name: str, python: str, mesh: str, seconds: float, cached: bool) -> Row:
+    """Everything about one code on one mesh.
+
+    cached: also the first solve with programs that another process compiled
+    """
     row = run(name, python, mesh, [], None, seconds) | {"name": name}
-    if name in COMPILED:
+    if cached and name in COMPILED:
         with tempfile.TemporaryDirectory() as cache:
             first_only = ["--first-only"]
             run(name, python, mesh, first_only, cache, seconds)  # fills the folder
@@ -224,13 +227,15 @@ def interpreters(args: argparse.Namespace) -> dict[str, str]:
     return {OURS: given.pop(OURS), **given}
 
 
-def compare(mesh: str, codes: dict[str, str], seconds: float) -> tuple[list[Row], dict[str, str]]:
+def compare(
+    mesh: str, codes: dict[str, str], seconds: float, cached: bool
+) -> tuple[list[Row], dict[str, str]]:
     """Rows of the codes that finished, and why others did not."""
     rows, failures = [], {}
     for name, python in codes.items():
         print(f"{mesh}: {name}", file=sys.stderr, flush=True)
         try:
-            rows.append(measure(name, python, mesh, seconds))
+            rows.append(measure(name, python, mesh, seconds, cached))
         except RuntimeError as error:
             if name == OURS:
                 raise
@@ -246,13 +251,14 @@ def main() -> None:
     parser.add_argument("--python", action="append", default=[], metavar="CODE=PATH")
     parser.add_argument("--mesh", action="append", metavar="NxNxN", help="default: 10x15x8")
     parser.add_argument("--timeout", type=float, default=1500.0, help="per process, s")
+    parser.add_argument("--skip-cached", action="store_true", help="no first solves with compiled programs")
     parser.add_argument("--out", type=Path, help="Markdown file")
     parser.add_argument("--results", type=Path, help="JSON file of everything measured")
     args = parser.parse_args()
     machine = f"{os.cpu_count()} cores {platform.machine()}"
     texts, everything, wrong = [f"{datetime.date.today()}, {machine}\n"], {}, []
     for mesh in args.mesh or ["10x15x8"]:
-        rows, failures = compare(mesh, interpreters(args), args.timeout)
+        rows, failures = compare(mesh, interpreters(args), args.timeout, not args.skip_cached)
         texts.append(report(mesh, rows, failures))
         everything[mesh] = rows
         wrong += [f"{mesh}: {line}" for line in disagreements(rows)]
