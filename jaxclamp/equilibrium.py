@@ -36,7 +36,7 @@ EASY_ITERATIONS = 5
 LARGEST_MOVE = 0.25
 """a Newton correction moves no node further than this part of the lumen radius"""
 LARGEST_GROWTH = 1e2
-"""a Newton step may leave a residual up to so many times the support reactions"""
+"""a Newton step may leave an imbalance of up to so many times the support reactions, or the one before"""
 ROUND_OFF = 1e-11
 """a correction below this part of the lumen radius is rounding: an unloaded, stress-free artery has
 no reactions to measure its residual by"""
@@ -246,7 +246,7 @@ def newton(
     lin = system.linearise(state, pressure) if reuse is None else reuse.lin
     if not _sound(lin):
         raise NotConverged("the predicted state is inverted", residual_norm(lin), float(lin.J_min))
-    cuts, first_norm = 0, math.inf
+    cuts, first_imbalance = 0, math.inf
     for iteration in range(MAX_NEWTON + 1):
         error = closing.error(state, lin)
         negative, responses = (
@@ -263,10 +263,10 @@ def newton(
         system.newton_iterations += 1
         state, lin, shortened = _admissible(system, state, lin, pressure, dx, d_height, MAX_CUTS - cuts)
         cuts += shortened
-        norm = residual_norm(lin)
-        first_norm = norm if iteration == 0 else first_norm
-        if iteration > 2 and norm > DIVERGING * first_norm:
-            raise NotConverged("Newton's residual grows", norm, float(lin.J_min))
+        imbalance = float(lin.imbalance)
+        first_imbalance = imbalance if iteration == 0 else first_imbalance
+        if iteration > 2 and imbalance > DIVERGING * first_imbalance:
+            raise NotConverged("Newton's residual grows", residual_norm(lin), float(lin.J_min))
     raise NotConverged(f"{MAX_NEWTON} Newton iterations", residual_norm(lin), float(lin.J_min))
 
 
@@ -318,10 +318,11 @@ def _admissible(
     """
     largest = max(float(np.max(np.abs(dx))), abs(d_height), 1e-300)
     fraction = min(1.0, LARGEST_MOVE * system.length / largest)
+    bound = LARGEST_GROWTH * max(float(lin.reactions), float(lin.imbalance))
     for cut in range(cuts_left + 1):
         trial = advance(system.body, state, dx, d_height, fraction)
         trial_lin = system.linearise(trial, pressure)
-        if _sound(trial_lin) and residual_norm(trial_lin) <= LARGEST_GROWTH * float(lin.reactions):
+        if _sound(trial_lin) and float(trial_lin.imbalance) <= bound:
             return trial, trial_lin, cut
         fraction *= 0.4
     raise NotConverged("no admissible step", residual_norm(lin), float(lin.J_min))
