@@ -37,9 +37,9 @@ LARGEST_MOVE = 0.25
 """a Newton correction moves no node further than this part of the lumen radius"""
 LARGEST_GROWTH = 1e2
 """a Newton step may leave an imbalance of up to so many times the support reactions, or the one before"""
-ROUND_OFF = 1e-11
-"""a correction below this part of the lumen radius is rounding: an unloaded, stress-free artery has
-no reactions to measure its residual by"""
+ROUND_OFF = 2.0**-52
+"""a residual that this relative change of the positions would make is rounding: an unloaded, stress-free
+artery has no reactions to measure its residual by, and a bulk modulus may be 1e6 times the stress"""
 VOLUME_TOLERANCE = 1e-8
 """largest |mean J - 1 - p/bulk| of a converged cell"""
 
@@ -198,14 +198,13 @@ def residual_norm(lin: Linearisation) -> float:
     return float(np.linalg.norm(lin.residual)) if largest < 1e150 else math.inf
 
 
-def _converged(system: System, lin: Linearisation, closing_error: float) -> bool:
-    small = residual_norm(lin) <= system.tolerance * max(float(lin.reactions), 1e-12)
-    return small and _closed(system, lin, closing_error)
-
-
-def _closed(system: System, lin: Linearisation, closing_error: float) -> bool:
-    """The cells have their volume, and the closing condition holds."""
-    return float(lin.volume_error) <= VOLUME_TOLERANCE and abs(closing_error) <= 1e-9 * system.length
+def _converged(system: System, state: State, lin: Linearisation, closing_error: float) -> bool:
+    """The forces balance to the tolerance or to rounding, cells have their volume, the closing holds."""
+    free = np.asarray(state.x).reshape(-1)[np.asarray(system.body.topology.free)]
+    rounding = ROUND_OFF * float(np.linalg.norm(lin.values[system.diagonal] * free))
+    small = residual_norm(lin) <= max(system.tolerance * float(lin.reactions), rounding)
+    closed = float(lin.volume_error) <= VOLUME_TOLERANCE and abs(closing_error) <= 1e-9 * system.length
+    return small and closed
 
 
 def _sound(lin: Linearisation) -> bool:
@@ -254,8 +253,7 @@ def newton(
         )
         reuse = None
         dx, d_height = _bordered_step(responses, lin, closing, error)
-        rounding = float(np.max(np.abs(dx), initial=0.0)) <= ROUND_OFF * system.length
-        if _converged(system, lin, error) or (rounding and _closed(system, lin, error)):
+        if _converged(system, state, lin, error):
             slope = -float(lin.jaw_stiffness) - float(np.dot(lin.jaw_coupling, responses[:, 1]))
             return Equilibrium(
                 state, pressure, step.axial_stretch, lin, negative, slope, responses, iteration
@@ -343,7 +341,7 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
     unit = 1e-3 * float(np.median(lin.values[system.diagonal]))
     shift, unstable = 0.0, False
     for iteration in range(MAX_DESCENT):
-        if _converged(system, lin, 0.0):
+        if _converged(system, state, lin, 0.0):
             equilibrium = newton(system, state, step)
             return dataclasses.replace(equilibrium, iterations=iteration, snapped=unstable)
         for _ in range(MAX_SHIFTS):
