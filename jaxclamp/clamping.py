@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxclamp.assembly import State, with_equilibrium_pressure
 from jaxclamp.equilibrium import (
+    Ease,
     Equilibrium,
     EquilibriumError,
     Held,
@@ -24,7 +25,7 @@ from jaxclamp.equilibrium import (
     Path,
     Step,
     System,
-    descend,
+    descend_eased,
     follow,
     newton,
     predict,
@@ -49,6 +50,9 @@ SMALLEST_SHARE = 1 / 16
 RESCUE_MOVE = 0.02
 """jaw move of a descent, as part of the outer radius"""
 MAX_RESCUES = 60
+EASY_BULK, EASY_CONTACT = 400.0, 100.0
+"""bulk modulus, and contact stiffness times the wall's thickness, over its shear modulus, with which the
+way downhill is easy"""
 LOAD_STEP = 0.3
 """first step of pressure and stretch, as part of the whole"""
 
@@ -292,7 +296,7 @@ class _Walk:
             height = float(equilibrium.state.jaw_height) - move
             step = self.held(height)
             try:
-                found = descend(self.system, equilibrium.state, step)
+                found = self.settle(equilibrium.state, step)
             except NotConverged as error:
                 failure, move = error, 0.5 * move
                 continue
@@ -303,12 +307,30 @@ class _Walk:
     def solve_or_descend(self, stage: str, start: State, step: Step, load: str) -> Equilibrium:
         """Newton, and if that fails the way downhill."""
         try:
-            return newton(self.system, start, step)
-        except NotConverged:
-            try:
-                return descend(self.system, start, step)
-            except NotConverged as error:
-                raise EquilibriumError(stage, f"at {load}", error, _ADVICE[stage]) from error
+            return self.settle(start, step)
+        except NotConverged as error:
+            raise EquilibriumError(stage, f"at {load}", error, _ADVICE[stage]) from error
+
+    def settle(self, start: State, step: Step) -> Equilibrium:
+        """A stable equilibrium at a held jaw: by Newton's method, or else downhill. Raises NotConverged."""
+        with contextlib.suppress(NotConverged):
+            found = newton(self.system, start, step)
+            if not found.negative_pivots:
+                return found
+        return descend_eased(self.system, start, step, self.ease)
+
+    @property
+    def ease(self) -> Ease:
+        """Penalties brought down to where they still do their work: well above the stiffness of the wall."""
+        scene = self.model.scene
+        materials = [layer.material for layer in scene.artery.layers]
+        wall = sum(float(layer.thickness) for layer in scene.artery.layers)
+        c = max(float(material.c) for material in materials)
+        bulk = max(float(material.bulk) for material in materials)
+        return Ease(
+            bulk=min(1.0, EASY_BULK * c / bulk),
+            contact=min(1.0, EASY_CONTACT * c / (float(scene.contact.stiffness) * wall)),
+        )
 
     def error(self, stage: str, last: Equilibrium, failure: NotConverged) -> EquilibriumError:
         """The sentence for a user, with the last load that did converge."""

@@ -33,6 +33,8 @@ SUFFICIENT_FALL = 1e-4
 GOOD_MODEL = 0.3
 EASY_ITERATIONS = 5
 """a step that converged in so many iterations lets the next one grow"""
+SMALLEST_STIFFENING = 1 / 32
+"""eased penalties are restored in steps of at least this share of the way, or given up"""
 LARGEST_MOVE = 0.25
 """a Newton correction moves no node further than this part of the lumen radius"""
 LARGEST_GROWTH = 1e2
@@ -358,7 +360,53 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
         if quality > GOOD_MODEL:
             shift = 0.25 * shift if shift > unit else 0.0
         state, lin = trial, trial_lin
-    raise NotConverged("the descent did not end", residual_norm(lin), float(lin.J_min))
+    raise NotConverged("the way downhill did not end", residual_norm(lin), float(lin.J_min))
+
+
+@dataclasses.dataclass(frozen=True)
+class Ease:
+    """How much softer the penalties are made to find a way: factors of at most 1."""
+
+    bulk: float
+    contact: float
+
+    def body(self, body: Body, share: float) -> Body:
+        """The body with its penalties eased by a share (1 fully, 0 not at all) of the way, in powers."""
+        contact = body.parameters.contact
+        softer = dataclasses.replace(contact, stiffness=contact.stiffness * self.contact**share)
+        stiffness = body.geometry.pressure_stiffness * self.bulk**share
+        return dataclasses.replace(
+            body,
+            geometry=dataclasses.replace(body.geometry, pressure_stiffness=stiffness),
+            parameters=dataclasses.replace(body.parameters, contact=softer),
+        )
+
+
+def descend_eased(system: System, state: State, step: Step, ease: Ease) -> Equilibrium:
+    """Go downhill with softer penalties, then stiffen them to their own values. Raises NotConverged.
+
+    Along a stiff penalty the potential is a narrow, curved valley that no descent gets far in; Newton's
+    method, with the pressures of the cells as unknowns of their own, follows the stiffening easily.
+    """
+    whole = system.body
+    try:
+        system.body = ease.body(whole, 1.0)
+        found = descend(system, state, step)
+        snapped, share, stride = found.snapped, 1.0, 0.5
+        while share > 0.0:
+            target = max(share - stride, 0.0)
+            system.body = ease.body(whole, target) if target else whole
+            try:
+                found, share = newton(system, found.state, step), target
+            except NotConverged:
+                stride *= 0.5
+                if stride < SMALLEST_STIFFENING:
+                    raise
+    finally:
+        system.body = whole
+    if found.negative_pivots:
+        raise NotConverged("lost stability", residual_norm(found.lin), float(found.lin.J_min))
+    return dataclasses.replace(found, snapped=snapped)
 
 
 def _downhill_step(system: System, lin: Linearisation, shift: float) -> np.ndarray | None:

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 import jaxclamp as jc
+from jaxclamp.meshes import build_mesh
+from jaxclamp.model import warnings
 from tube import Incompressible, Sector, extra_stress
 
 Point = Mapping[str, float]
@@ -203,10 +205,11 @@ def scene_of(point: Point) -> jc.Scene:
 
 
 def is_sensible(point: Point) -> bool:
-    """True if every value is sensible, and the artery survives its pressure and stretch.
+    """True if every value is sensible, the mesh resolves the jaw, and the artery survives its loads.
 
-    The second is the answer of the semi-analytic tube: there is an equilibrium, it widens the lumen
-    no more than arteries widen, and no stress is beyond the strength of the wall.
+    The second is that `jaxclamp show` does not warn. The third is the answer of the semi-analytic
+    tube: there is an equilibrium, it widens the lumen no more than arteries widen, and no stress is
+    beyond the strength of the wall.
     """
     if any(
         not axis.sensible[0] <= point.get(name, axis.sensible[0]) <= axis.sensible[1]
@@ -214,8 +217,10 @@ def is_sensible(point: Point) -> bool:
     ):
         return False
     try:
-        artery = scene_of(point).artery
+        scene = scene_of(point)
     except jc.SceneError:
+        return False
+    if warnings(scene, build_mesh(scene.mesh)):
         return False
     sectors = [
         Sector(
@@ -227,9 +232,9 @@ def is_sensible(point: Point) -> bool:
             k2=layer.material.k2,
             fibre_angle=math.degrees(layer.material.fibre_angle),
         )
-        for layer in artery.layers
+        for layer in scene.artery.layers
     ]
-    return survives(tuple(sectors), float(artery.pressure), float(artery.axial_stretch))
+    return survives(tuple(sectors), float(scene.artery.pressure), float(scene.artery.axial_stretch))
 
 
 def survives(sectors: tuple[Sector, ...], pressure: float, stretch: float) -> bool:
