@@ -105,9 +105,11 @@ class _Walk:
     def check(self, values: dict[str, Any]) -> None:
         """Refuse a closing state that the model does not cover. Raises EquilibriumError."""
         reason, thickness = None, self.outer_radius - self.lumen_radius
+        if values["outer_radius_mm"] - values["jaw_height_mm"] > LARGEST_SINKING * thickness:
+            reason = "the jaw sinks in between the contact points of the wall: refine the mesh under it"
         if values["lumen_overlap_mm"] > LARGEST_SINKING * thickness:
             reason = "the inner walls sink into each other: raise contact.stiffness_kPa_per_mm"
-        elif values["max_penetration_mm"] > LARGEST_SINKING * thickness:
+        if values["max_penetration_mm"] > LARGEST_SINKING * thickness:
             reason = "the jaws sink into the wall: raise contact.stiffness_kPa_per_mm"
         if reason is not None:
             raise self.error("clamping", self.states[-1].equilibrium, NotConverged(reason))
@@ -147,6 +149,9 @@ class _Walk:
                 equilibrium = newton(self.system, guess, path(1.0))
         if equilibrium is None or equilibrium.negative_pivots:
             equilibrium = self.walk("physiological", load_free, path, tell, lambda e: False, LOAD_STEP)
+            if equilibrium.negative_pivots:
+                buckled = NotConverged("the artery loses stability: it buckles or bulges")
+                raise self.error("physiological", equilibrium, buckled)
         self.system.length = float(equilibrium.state.x[self.model.marks.lumen_top, 1])
         self.keep("physiological", equilibrium, 1.0, f"lumen radius {self.system.length:.3f} mm")
         return equilibrium
@@ -290,6 +295,8 @@ class _Walk:
         if failure is None:
             return equilibrium
         if stage != "clamping":
+            if self.inflated(start) is None:
+                failure = NotConverged("the wall does not carry the pressure: it balloons")
             raise self.error(stage, equilibrium, failure)
         move = RESCUE_MOVE * self.outer_radius
         while move > 1e-3 * RESCUE_MOVE * self.outer_radius:
@@ -334,6 +341,8 @@ class _Walk:
 
     def error(self, stage: str, last: Equilibrium, failure: NotConverged) -> EquilibriumError:
         """The sentence for a user, with the last load that did converge."""
+        if stage == "clamping" and float(last.state.jaw_height) == self.far:
+            return EquilibriumError(stage, "at first contact", failure, _ADVICE[stage])
         if stage == "clamping":
             occlusion = 1.0 - self.top(last) / self.lumen_radius
             load = f"occlusion {occlusion:.1%}, jaw height {float(last.state.jaw_height):.4f} mm"

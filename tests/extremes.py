@@ -308,7 +308,7 @@ def flaw_of_refusal(said: str) -> str:
     return ""
 
 
-ROUNDING = 1e-12
+ROUNDING = 1e-11
 """mN per kPa of bulk modulus: what rounding leaves of a pressure over a square millimetre"""
 LARGEST_SINKING = 0.5
 """penetration, and overlap of the inner walls, over the thickness of the wall in the body"""
