@@ -20,8 +20,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import jaxclamp as jc
 from extremes import AXES, COUNTS, Point, draw, judge, random_corners, random_points, row
+from jaxclamp.results import versions
 
 STEPS = 7
 """values of a single axis"""
@@ -68,9 +68,7 @@ def read() -> list[Row]:
 def append(line: dict[str, object]) -> None:
     new = not TABLE.is_file()
     with TABLE.open("a", newline="") as file:
-        writer = csv.DictWriter(
-            file, line, lineterminator="\n", extrasaction="raise", quoting=csv.QUOTE_MINIMAL
-        )
+        writer = csv.DictWriter(file, line, lineterminator="\n")
         if new:
             writer.writeheader()
         writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in line.items()})
@@ -125,9 +123,10 @@ def fifths(name: str, lines: list[Row]) -> list[str]:
 
 
 def text(lines: list[Row]) -> str:
-    of = lambda name: [line for line in lines if line["set"] == name]  # noqa: E731
+    of = lambda name: [line for line in lines if line["set"] == name]
     sensible = [line for line in lines if line["sensible"] == "True"]
-    refusals = Counter(cause(line) for line in lines if line["outcome"] == "refused")
+    refused = [line for line in lines if line["outcome"] == "refused"]
+    refusals = Counter(cause(line) for line in refused)
     seconds = sorted(float(line["seconds"]) for line in lines)
     notes = Counter(note for line in lines for note in line["notes"].split(", ") if note)
     through = sum(COUNTS["radial"])
@@ -135,22 +134,29 @@ def text(lines: list[Row]) -> str:
     box = [single(name, lines) for name in AXES]
     sets = [[f"{name}: {what}", *counts(of(name))] for name, what in SETS.items()]
     sets += [["all of these that are sensible", *counts(sensible)], ["all", *counts(lines)]]
+    causes = [
+        [said, str(n), str(sum(line["sensible"] == "True" and cause(line) == said for line in refused))]
+        for said, n in refusals.most_common()
+    ]
+    unstable = ", ".join(f"{note} {n}" for note, n in notes.items()) or "none"
+    longest = [seconds[len(seconds) // 2], seconds[int(0.95 * len(seconds))], seconds[-1]]
     return f"""# Where scenes are solved, and where they are refused
 
-Written by `tests/benchmarks/extremes_map.py` on {datetime.date.today()}, jaxclamp {jc.__version__}, from `extremes.csv`.
+Written by `tests/benchmarks/extremes_map.py` on {datetime.date.today()}, jaxclamp {versions()["jaxclamp"]};
+every scene is a line of `extremes.csv`.
 
-Every scene is human-lad on {cells} elements, with some of these quantities changed. A scene is *solved* if it
-converged and passes the independent checks (forces balance to 1e-6, the jaws' work is the change of energy,
-J > 0, penetration and overlap below half the wall, all numbers finite); *refused* if it ends with one sentence
-that names the cause; anything else is *wrong*. Sensible is a scene whose values are all in the sensible part
-of their range, whose mesh resolves its jaw (`jaxclamp show` does not warn), and whose artery survives its loads:
-by the semi-analytic tube there is an equilibrium that widens the lumen to at most twice its load-free size, with
-stresses below 2 MPa.
+Every scene is human-lad on {cells} elements, with some of these quantities changed. A scene is *solved*
+if it converged and passes the independent checks (forces balance to 1e-6, the jaws' work is the change of
+energy, J > 0, penetration and overlap below half the wall, all numbers finite); *refused* if it ends with
+one sentence that names the cause; anything else is *wrong*. Sensible is a scene whose values are all in the
+sensible part of their range, whose mesh resolves its jaw (`jaxclamp show` does not warn), and whose artery
+survives its loads: by the semi-analytic tube there is an equilibrium that widens the lumen to at most twice
+its load-free size, with stresses below 2 MPa.
 
 {table(["scenes", "count", "solved", "refused", "wrong", "solved"], sets)}
 
-Lost stability among the solved: {", ".join(f"{note} {n}" for note, n in notes.items()) or "none"} (reported with each result).
-Seconds a scene: median {seconds[len(seconds) // 2]:.2g}, 95 % below {seconds[int(0.95 * len(seconds))]:.2g}, longest {seconds[-1]:.2g}.
+Lost stability among the solved: {unstable} (reported with each result).
+Seconds a scene: half below {longest[0]:.2g}, 95 % below {longest[1]:.2g}, longest {longest[2]:.2g}.
 
 ## The box, and what came of single axes (+ solved, - refused, ! wrong)
 
@@ -162,7 +168,7 @@ Seconds a scene: median {seconds[len(seconds) // 2]:.2g}, 95 % below {seconds[in
 
 ## Causes of refusal
 
-{table(["stage and cause", "count", "of these sensible"], [[said, str(n), str(sum(cause(line) == said for line in sensible if line["outcome"] == "refused"))] for said, n in refusals.most_common()])}
+{table(["stage and cause", "count", "of these sensible"], causes)}
 """
 
 
