@@ -43,8 +43,8 @@ def points(name: str) -> list[Point]:
         return [draw({axis: k / (STEPS - 1)}) for axis in AXES for k in range(STEPS)]
     sensible = name.startswith("sensible")
     if name.endswith("random"):
-        return list(random_points(200 if sensible else 120, 1, sensible))
-    return list(random_corners(100 if sensible else 60, 1, sensible))
+        return list(random_points(200 if sensible else 80, 1, sensible))
+    return list(random_corners(100 if sensible else 40, 1, sensible))
 
 
 def survey(seconds: float) -> bool:
