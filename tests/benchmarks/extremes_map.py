@@ -32,6 +32,7 @@ SETS = {
     "box, random": "every value drawn from its whole range",
     "box, corners": "every value at one end of its range, drawn at random",
 }
+SIZES = {"sensible, random": 200, "sensible, corners": 100, "box, random": 80, "box, corners": 40}
 TABLE, TEXT = Path("docs/extremes.csv"), Path("docs/extremes.md")
 
 Row = dict[str, str]
@@ -41,10 +42,8 @@ def points(name: str) -> list[Point]:
     """The scenes of a set."""
     if name == "single axes":
         return [draw({axis: k / (STEPS - 1)}) for axis in AXES for k in range(STEPS)]
-    sensible = name.startswith("sensible")
-    if name.endswith("random"):
-        return list(random_points(200 if sensible else 80, 1, sensible))
-    return list(random_corners(100 if sensible else 40, 1, sensible))
+    choose = random_points if name.endswith("random") else random_corners
+    return list(choose(SIZES[name], 1, name.startswith("sensible")))
 
 
 def survey(seconds: float) -> bool:
@@ -119,7 +118,7 @@ def fifths(name: str, lines: list[Row]) -> list[str]:
     for line in lines:
         if line["set"] == "box, random":
             found[min(int(5 * AXES[name].share(float(line[name]))), 4)].append(line)
-    return [f"`{name}`", *(f"{counts(part)[1]}/{len(part)}" for part in found)]
+    return [f"`{name}`", *(f"{counts(part)[1]}/{len(part)}" if part else "-" for part in found)]
 
 
 def text(lines: list[Row]) -> str:
@@ -134,6 +133,7 @@ def text(lines: list[Row]) -> str:
     box = [single(name, lines) for name in AXES]
     sets = [[f"{name}: {what}", *counts(of(name))] for name, what in SETS.items()]
     sets += [["all of these that are sensible", *counts(sensible)], ["all", *counts(lines)]]
+    missing = [f"{SIZES[name] - len(of(name))} of {name}" for name in SIZES if len(of(name)) < SIZES[name]]
     causes = [
         [said, str(n), str(sum(line["sensible"] == "True" and cause(line) == said for line in refused))]
         for said, n in refusals.most_common()
@@ -143,7 +143,7 @@ def text(lines: list[Row]) -> str:
     return f"""# Where scenes are solved, and where they are refused
 
 Written by `tests/benchmarks/extremes_map.py` on {datetime.date.today()}, jaxclamp {versions()["jaxclamp"]};
-every scene is a line of `extremes.csv`.
+every scene is a line of `extremes.csv`. Scenes still to be judged: {", ".join(missing) or "none"}.
 
 Every scene is human-lad on {cells} elements, with some of these quantities changed. A scene is *solved*
 if it converged and passes the independent checks (forces balance to 1e-6, the jaws' work is the change of
