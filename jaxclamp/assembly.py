@@ -215,6 +215,9 @@ class Linearisation:
     """potential with the pressures at their best, uJ"""
     residual: Array
     """d Pi/dx of the free degrees of freedom, pressures condensed, mN, (n_free,)"""
+    imbalance: Array
+    """norm of the free forces at the *stored* pressures, mN: what a trial state is judged by, because
+    the condensed residual multiplies every change of volume that is of second order by the bulk modulus"""
     reactions: Array
     """norm of the forces on the supports, mN"""
     volume_error: Array
@@ -320,7 +323,9 @@ class Block:
     energy: Array
     """wall energy with the pressures at their best, uJ"""
     force: Array
-    """d Pi/dx of the cells' nodes, pressures condensed, mN, (n_en, 3, n_cells)"""
+    """d Pi/dx of the cells' nodes at the stored pressures, mN, (n_en, 3, n_cells)"""
+    missing_force: Array
+    """what condensing the pressures adds to it, mN, (n_en, 3, n_cells)"""
     matrix: Array
     """condensed tangent, mN/mm, (n_en, n_en, 6, n_cells)"""
     volume_error: Array
@@ -381,7 +386,7 @@ def linearise_block(piece: Piece, stencils: Stencils, material: Material) -> Blo
     stiff_modes = [
         total(g.pressure_stiffness[m, n] * mode for n, mode in enumerate(modes)) for m in range(len(modes))
     ]
-    force = force + total(mode * missing[m] for m, mode in enumerate(modes))
+    missing_force = total(mode * missing[m] for m, mode in enumerate(modes))
     matrix = matrix + total(
         jnp.stack([a[:, None, i] * b[None, :, j] for i, j in PAIRS], axis=2)
         for a, b in zip(modes, stiff_modes, strict=True)
@@ -393,6 +398,7 @@ def linearise_block(piece: Piece, stencils: Stencils, material: Material) -> Blo
     return Block(
         energy=jnp.sum(energies) + volumetric,
         force=force,
+        missing_force=missing_force,
         matrix=matrix,
         volume_error=jnp.max(jnp.abs(jnp.einsum("mq,mc->qc", stencils.modes, missing)) * compliance),
         J_min=jnp.min(J),
@@ -435,9 +441,12 @@ def assemble(body: Body, state: State, pressure: Array, blocks: list[Block]) -> 
         values = values.at[slots].add(matrix.ravel(), mode="promise_in_bounds")
     inner = _scatter(top.lumen_facets, lumen_f + meet_f, n_nodes)
     force = inner + _scatter(top.outer_facets, jaw_f, n_nodes)
+    missing = jnp.zeros_like(force)
     for (_, first, last), block in zip(top.blocks, blocks, strict=True):
         force = force + _scatter(top.cells[:, first:last], block.force, n_nodes)
-    force = force.ravel()
+        missing = missing + _scatter(top.cells[:, first:last], block.missing_force, n_nodes)
+    imbalance = jnp.linalg.norm(force.ravel()[top.free])
+    force = (force + missing).ravel()
 
     slope_of_height = lambda d: jax.grad(contact_potential, argnums=(1, 2))(body, x, d)  # noqa: E731
     (_, along_height), (coupling, stiffness) = jax.jvp(
@@ -446,6 +455,7 @@ def assemble(body: Body, state: State, pressure: Array, blocks: list[Block]) -> 
     return Linearisation(
         energy=total(b.energy for b in blocks) + jnp.sum(lumen_e) + jnp.sum(meet_e) + jnp.sum(jaw_e),
         residual=force[top.free],
+        imbalance=imbalance,
         reactions=jnp.linalg.norm(force.at[top.free].set(0.0)),
         volume_error=jnp.max(jnp.stack([b.volume_error for b in blocks])),
         values=values[:-1],

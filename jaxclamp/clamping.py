@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxclamp.assembly import State, with_equilibrium_pressure
 from jaxclamp.equilibrium import (
+    Ease,
     Equilibrium,
     EquilibriumError,
     Held,
@@ -24,7 +25,7 @@ from jaxclamp.equilibrium import (
     Path,
     Step,
     System,
-    descend,
+    descend_eased,
     follow,
     newton,
     predict,
@@ -50,6 +51,9 @@ SMALLEST_SHARE = 1 / 16
 RESCUE_MOVE = 0.02
 """jaw move of a descent, as part of the outer radius"""
 MAX_RESCUES = 60
+EASY_BULK, EASY_CONTACT = 400.0, 100.0
+"""bulk modulus, and contact stiffness times the wall's thickness, over its shear modulus, with which the
+way downhill is easy"""
 LOAD_STEP = 0.3
 """first step of pressure and stretch, as part of the whole"""
 
@@ -102,9 +106,11 @@ class _Walk:
     def check(self, values: dict[str, Any]) -> None:
         """Refuse a closing state that the model does not cover. Raises EquilibriumError."""
         reason, thickness = None, self.outer_radius - self.lumen_radius
+        if values["outer_radius_mm"] - values["jaw_height_mm"] > LARGEST_SINKING * thickness:
+            reason = "the jaw sinks in between the contact points of the wall: refine the mesh under it"
         if values["lumen_overlap_mm"] > LARGEST_SINKING * thickness:
             reason = "the inner walls sink into each other: raise contact.stiffness_kPa_per_mm"
-        elif values["max_penetration_mm"] > LARGEST_SINKING * thickness:
+        if values["max_penetration_mm"] > LARGEST_SINKING * thickness:
             reason = "the jaws sink into the wall: raise contact.stiffness_kPa_per_mm"
         if reason is not None:
             raise self.error("clamping", self.states[-1].equilibrium, NotConverged(reason))
@@ -144,6 +150,9 @@ class _Walk:
                 equilibrium = newton(self.system, guess, path(1.0))
         if equilibrium is None or equilibrium.negative_pivots:
             equilibrium = self.walk("physiological", load_free, path, tell, lambda e: False, LOAD_STEP)
+            if equilibrium.negative_pivots:
+                buckled = NotConverged("the artery loses stability: it buckles or bulges")
+                raise self.error("physiological", equilibrium, buckled)
         self.system.length = float(equilibrium.state.x[self.model.marks.lumen_top, 1])
         self.keep("physiological", equilibrium, 1.0, f"lumen radius {self.system.length:.3f} mm")
         return equilibrium
@@ -287,13 +296,15 @@ class _Walk:
         if failure is None:
             return equilibrium
         if stage != "clamping":
+            if self.inflated(start) is None:
+                failure = NotConverged("the wall does not carry the pressure: it balloons")
             raise self.error(stage, equilibrium, failure)
         move = RESCUE_MOVE * self.outer_radius
         while move > 1e-3 * RESCUE_MOVE * self.outer_radius:
             height = float(equilibrium.state.jaw_height) - move
             step = self.held(height)
             try:
-                found = descend(self.system, equilibrium.state, step)
+                found = self.settle(equilibrium.state, step)
             except NotConverged as error:
                 failure, move = error, 0.5 * move
                 continue
@@ -304,15 +315,35 @@ class _Walk:
     def solve_or_descend(self, stage: str, start: State, step: Step, load: str) -> Equilibrium:
         """Newton, and if that fails the way downhill."""
         try:
-            return newton(self.system, start, step)
-        except NotConverged:
-            try:
-                return descend(self.system, start, step)
-            except NotConverged as error:
-                raise EquilibriumError(stage, f"at {load}", error, _ADVICE[stage]) from error
+            return self.settle(start, step)
+        except NotConverged as error:
+            raise EquilibriumError(stage, f"at {load}", error, _ADVICE[stage]) from error
+
+    def settle(self, start: State, step: Step) -> Equilibrium:
+        """A stable equilibrium at a held jaw: by Newton's method, or else downhill. Raises NotConverged."""
+        with contextlib.suppress(NotConverged):
+            found = newton(self.system, start, step)
+            if not found.negative_pivots:
+                return found
+        return descend_eased(self.system, start, step, self.ease)
+
+    @property
+    def ease(self) -> Ease:
+        """Penalties brought down to where they still do their work: well above the stiffness of the wall."""
+        scene = self.model.scene
+        materials = [layer.material for layer in scene.artery.layers]
+        wall = sum(float(layer.thickness) for layer in scene.artery.layers)
+        c = max(float(material.c) for material in materials)
+        bulk = max(float(material.bulk) for material in materials)
+        return Ease(
+            bulk=min(1.0, EASY_BULK * c / bulk),
+            contact=min(1.0, EASY_CONTACT * c / (float(scene.contact.stiffness) * wall)),
+        )
 
     def error(self, stage: str, last: Equilibrium, failure: NotConverged) -> EquilibriumError:
         """The sentence for a user, with the last load that did converge."""
+        if stage == "clamping" and float(last.state.jaw_height) == self.far:
+            return EquilibriumError(stage, "at first contact", failure, _ADVICE[stage])
         if stage == "clamping":
             occlusion = 1.0 - self.top(last) / self.lumen_radius
             load = f"occlusion {occlusion:.1%}, jaw height {float(last.state.jaw_height):.4f} mm"

@@ -33,13 +33,15 @@ SUFFICIENT_FALL = 1e-4
 GOOD_MODEL = 0.3
 EASY_ITERATIONS = 5
 """a step that converged in so many iterations lets the next one grow"""
+SMALLEST_STIFFENING = 1 / 32
+"""eased penalties are restored in steps of at least this share of the way, or given up"""
 LARGEST_MOVE = 0.25
 """a Newton correction moves no node further than this part of the lumen radius"""
 LARGEST_GROWTH = 1e2
-"""a Newton step may leave a residual up to so many times the support reactions"""
-ROUND_OFF = 1e-11
-"""a correction below this part of the lumen radius is rounding: an unloaded, stress-free artery has
-no reactions to measure its residual by"""
+"""a Newton step may leave an imbalance of up to so many times the support reactions, or the one before"""
+ROUND_OFF = 2.0**-52
+"""a residual that this relative change of the positions would make is rounding: an unloaded, stress-free
+artery has no reactions to measure its residual by, and a bulk modulus may be 1e6 times the stress"""
 VOLUME_TOLERANCE = 1e-8
 """largest |mean J - 1 - p/bulk| of a converged cell"""
 
@@ -198,14 +200,13 @@ def residual_norm(lin: Linearisation) -> float:
     return float(np.linalg.norm(lin.residual)) if largest < 1e150 else math.inf
 
 
-def _converged(system: System, lin: Linearisation, closing_error: float) -> bool:
-    small = residual_norm(lin) <= system.tolerance * max(float(lin.reactions), 1e-12)
-    return small and _closed(system, lin, closing_error)
-
-
-def _closed(system: System, lin: Linearisation, closing_error: float) -> bool:
-    """The cells have their volume, and the closing condition holds."""
-    return float(lin.volume_error) <= VOLUME_TOLERANCE and abs(closing_error) <= 1e-9 * system.length
+def _converged(system: System, state: State, lin: Linearisation, closing_error: float) -> bool:
+    """The forces balance to the tolerance or to rounding, cells have their volume, the closing holds."""
+    free = np.asarray(state.x).reshape(-1)[np.asarray(system.body.topology.free)]
+    rounding = ROUND_OFF * float(np.linalg.norm(lin.values[system.diagonal] * free))
+    small = residual_norm(lin) <= max(system.tolerance * float(lin.reactions), rounding)
+    closed = float(lin.volume_error) <= VOLUME_TOLERANCE and abs(closing_error) <= 1e-9 * system.length
+    return small and closed
 
 
 def _sound(lin: Linearisation) -> bool:
@@ -246,7 +247,7 @@ def newton(
     lin = system.linearise(state, pressure) if reuse is None else reuse.lin
     if not _sound(lin):
         raise NotConverged("the predicted state is inverted", residual_norm(lin), float(lin.J_min))
-    cuts, first_norm = 0, math.inf
+    cuts, first_imbalance = 0, math.inf
     for iteration in range(MAX_NEWTON + 1):
         error = closing.error(state, lin)
         negative, responses = (
@@ -254,8 +255,7 @@ def newton(
         )
         reuse = None
         dx, d_height = _bordered_step(responses, lin, closing, error)
-        rounding = float(np.max(np.abs(dx), initial=0.0)) <= ROUND_OFF * system.length
-        if _converged(system, lin, error) or (rounding and _closed(system, lin, error)):
+        if _converged(system, state, lin, error):
             slope = -float(lin.jaw_stiffness) - float(np.dot(lin.jaw_coupling, responses[:, 1]))
             return Equilibrium(
                 state, pressure, step.axial_stretch, lin, negative, slope, responses, iteration
@@ -263,10 +263,10 @@ def newton(
         system.newton_iterations += 1
         state, lin, shortened = _admissible(system, state, lin, pressure, dx, d_height, MAX_CUTS - cuts)
         cuts += shortened
-        norm = residual_norm(lin)
-        first_norm = norm if iteration == 0 else first_norm
-        if iteration > 2 and norm > DIVERGING * first_norm:
-            raise NotConverged("Newton's residual grows", norm, float(lin.J_min))
+        imbalance = float(lin.imbalance)
+        first_imbalance = imbalance if iteration == 0 else first_imbalance
+        if iteration > 2 and imbalance > DIVERGING * first_imbalance:
+            raise NotConverged("Newton's residual grows", residual_norm(lin), float(lin.J_min))
     raise NotConverged(f"{MAX_NEWTON} Newton iterations", residual_norm(lin), float(lin.J_min))
 
 
@@ -318,10 +318,11 @@ def _admissible(
     """
     largest = max(float(np.max(np.abs(dx))), abs(d_height), 1e-300)
     fraction = min(1.0, LARGEST_MOVE * system.length / largest)
+    bound = LARGEST_GROWTH * max(float(lin.reactions), float(lin.imbalance))
     for cut in range(cuts_left + 1):
         trial = advance(system.body, state, dx, d_height, fraction)
         trial_lin = system.linearise(trial, pressure)
-        if _sound(trial_lin) and residual_norm(trial_lin) <= LARGEST_GROWTH * float(lin.reactions):
+        if _sound(trial_lin) and float(trial_lin.imbalance) <= bound:
             return trial, trial_lin, cut
         fraction *= 0.4
     raise NotConverged("no admissible step", residual_norm(lin), float(lin.J_min))
@@ -342,7 +343,7 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
     unit = 1e-3 * float(np.median(lin.values[system.diagonal]))
     shift, unstable = 0.0, False
     for iteration in range(MAX_DESCENT):
-        if _converged(system, lin, 0.0):
+        if _converged(system, state, lin, 0.0):
             equilibrium = newton(system, state, step)
             return dataclasses.replace(equilibrium, iterations=iteration, snapped=unstable)
         for _ in range(MAX_SHIFTS):
@@ -359,7 +360,53 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
         if quality > GOOD_MODEL:
             shift = 0.25 * shift if shift > unit else 0.0
         state, lin = trial, trial_lin
-    raise NotConverged("the descent did not end", residual_norm(lin), float(lin.J_min))
+    raise NotConverged("the way downhill did not end", residual_norm(lin), float(lin.J_min))
+
+
+@dataclasses.dataclass(frozen=True)
+class Ease:
+    """How much softer the penalties are made to find a way: factors of at most 1."""
+
+    bulk: float
+    contact: float
+
+    def body(self, body: Body, share: float) -> Body:
+        """The body with its penalties eased by a share (1 fully, 0 not at all) of the way, in powers."""
+        contact = body.parameters.contact
+        softer = dataclasses.replace(contact, stiffness=contact.stiffness * self.contact**share)
+        stiffness = body.geometry.pressure_stiffness * self.bulk**share
+        return dataclasses.replace(
+            body,
+            geometry=dataclasses.replace(body.geometry, pressure_stiffness=stiffness),
+            parameters=dataclasses.replace(body.parameters, contact=softer),
+        )
+
+
+def descend_eased(system: System, state: State, step: Step, ease: Ease) -> Equilibrium:
+    """Go downhill with softer penalties, then stiffen them to their own values. Raises NotConverged.
+
+    Along a stiff penalty the potential is a narrow, curved valley that no descent gets far in; Newton's
+    method, with the pressures of the cells as unknowns of their own, follows the stiffening easily.
+    """
+    whole = system.body
+    try:
+        system.body = ease.body(whole, 1.0)
+        found = descend(system, state, step)
+        snapped, share, stride = found.snapped, 1.0, 0.5
+        while share > 0.0:
+            target = max(share - stride, 0.0)
+            system.body = ease.body(whole, target) if target else whole
+            try:
+                found, share = newton(system, found.state, step), target
+            except NotConverged:
+                stride *= 0.5
+                if stride < SMALLEST_STIFFENING:
+                    raise
+    finally:
+        system.body = whole
+    if found.negative_pivots:
+        raise NotConverged("lost stability", residual_norm(found.lin), float(found.lin.J_min))
+    return dataclasses.replace(found, snapped=snapped)
 
 
 def _downhill_step(system: System, lin: Linearisation, shift: float) -> np.ndarray | None:

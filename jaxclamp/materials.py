@@ -22,11 +22,12 @@ from jaxclamp.tensors import Tensor, det, exponential_stiffening, squared_norm, 
 class Material(abc.ABC):
     """psi(F) = U(J) + psi_bar(F), the penalty form of Eq. (1).
 
-    A law is one record with `bulk`, its other constants, and `psi_bar`. Elements evaluate
-    psi_bar at the points and U with the dilatation averaged over the cell.
+    A law is one record with `c` (its shear modulus), `bulk`, its other constants, and `psi_bar`.
+    Elements evaluate psi_bar at the points and U with the dilatation averaged over the cell.
     """
 
     law: str
+    c: Array
     bulk: Array
 
     @abc.abstractmethod

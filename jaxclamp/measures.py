@@ -259,7 +259,8 @@ def _balance(body: Body, state: State, pressure: Array, marks: Landmarks) -> Rep
 
     Residual and balance come from the gradient of the potential, not from the assembled system
     that was solved. The balance is that of the modelled part along y: the cut through the wall, the
-    pressure on the lumen's projection and the contact of the inner walls against the force on the jaw.
+    pressure on the lumen's projection and the contact of the inner walls against the force on the jaw;
+    relative to the largest of them, or, where all vanish, to a thousandth of the wall's other forces.
     """
     energy, elastic = jax.value_and_grad(potential, argnums=1)(body, state.x, state.jaw_height, 0.0)
     volume, swelling = jax.value_and_grad(lumen_volume, argnums=1)(body, state.x)
@@ -275,7 +276,7 @@ def _balance(body: Body, state: State, pressure: Array, marks: Landmarks) -> Rep
         "lumen_contact_force_N": 1e-3 * PARTS_OF_A_JAW * between_walls,
         "total_energy_uJ": PARTS * (energy - pressure * volume),
         "residual_mN": jnp.linalg.norm(residual),
-        "force_balance_error": imbalance / (largest + 1e-6),
+        "force_balance_error": imbalance / (jnp.maximum(largest, 1e-3 * jnp.linalg.norm(elastic)) + 1e-6),
     }
 
 
