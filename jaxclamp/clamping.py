@@ -38,7 +38,7 @@ from jaxclamp.meshes import closed_positions
 from jaxclamp.model import Model, build_model, same_kind
 from jaxclamp.results import Kept, LinearSolvers, Result, work_balance
 from jaxclamp.scene import ForceStop, OcclusionStop, Scene, TravelStop
-from jaxclamp.scene_file import require_possible
+from jaxclamp.scene_file import require_computable
 
 FIRST_TOUCH = 0.02
 """the first closing step, as part of the outer radius: enough to bring points into contact"""
@@ -386,7 +386,7 @@ def clamp(
     progress: True for lines on standard error, or a function of `Progress`
 
     Raises EquilibriumError if the stop is not reached; its `result` keeps what did converge.
-    Raises SceneError for a scene that no scene file could hold.
+    Raises SceneError for a number that is not finite, or not positive where it has to be.
     """
     return _clamp(scene, guess, progress, to_stop=True)
 
@@ -394,7 +394,7 @@ def clamp(
 def inflate(scene: Scene, *, guess: Result | None = None) -> Result:
     """The artery of a scene in the body: load-free and physiological states, no clamp.
 
-    Raises EquilibriumError, and SceneError for a scene that no scene file could hold.
+    Raises EquilibriumError, and SceneError as `clamp` does.
     """
     return _clamp(scene, guess, None, to_stop=False)
 
@@ -406,7 +406,7 @@ def _clamp(
     to_stop: bool,
 ) -> Result:
     start = time.perf_counter()
-    require_possible(scene)
+    require_computable(scene)
     model = build_model(scene, None if guess is None else guess.model)
     neighbour = guess is not None and guess.converged and same_kind(scene, guess.scene)
     warm = guess if neighbour else None
@@ -493,6 +493,32 @@ def _warm_stop(walk: _Walk, guess: Result, last: Equilibrium) -> Equilibrium | N
     walk.use(target)
     walk.refer_to(base)
     return last if reached == 1.0 else None
+
+
+def predicted(result: Result, scene: Scene) -> Result:
+    """What a neighbouring scene would give, to first order: a linear solve per state, no iteration.
+
+    The scene has the same mesh and loads. The states are predictions, not equilibria.
+    """
+    assert result.physiological is not None
+    walk = _Walk(
+        build_model(scene, result.model), lambda event: None, time.perf_counter(), result.linear_solvers
+    )
+    base, last = result.physiological.equilibrium, result.states[-1]
+    walk.refer_to(base)
+    walk.system.length = walk.lumen_radius
+    values = np.asarray(base.lin.values)
+    in_body = dataclasses.replace(walk.system, solver=result.linear_solvers.holding(values))
+    near = predict(in_body, base, walk.held(float(base.state.jaw_height)))
+    walk.keep("physiological", dataclasses.replace(base, state=near), 1.0, "")
+    if last.stage == "clamping":
+        walk.refer_to(walk.states[0].equilibrium)
+        if not walk.system.solver.holds(np.asarray(last.equilibrium.lin.values)):
+            walk.system.solver.factor(np.asarray(last.equilibrium.lin.values))
+        step = walk.step(_closing_at_stop(walk, last.equilibrium))
+        near = predict(walk.system, last.equilibrium, step)
+        walk.keep("clamping", dataclasses.replace(last.equilibrium, state=near), 1.0, "")
+    return dataclasses.replace(result, model=walk.model, states=tuple(walk.states))
 
 
 def between(a: Scene, b: Scene, t: float) -> Scene:

@@ -262,10 +262,11 @@ def _solve(scene: Scene, quiet: bool) -> tuple[Any, Exception | None]:
     """The result (None if there is nothing to keep), and why it does not reach the stop."""
     from jaxclamp.clamping import clamp
     from jaxclamp.equilibrium import EquilibriumError
+    from jaxclamp.errors import with_errors
 
     try:
         with console.progress(quiet) as progress:
-            result = clamp(scene, progress=progress)
+            result = with_errors(clamp(scene, progress=progress))
     except EquilibriumError as error:
         return error.result, error
     return result, None if result.converged else result.failure

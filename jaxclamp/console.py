@@ -87,11 +87,19 @@ def summary(result: dict[str, Any], files: list[Path]) -> list[str]:
             parts = value if isinstance(value, dict) else {"": value}
             for layer, number in parts.items():
                 label, unit = label_and_unit(key)
-                output.append(
-                    f"    {f'{label}, {layer}' if layer else label:<36}{figure(number):>10} {unit}".rstrip()
-                )
+                named = f"{label}, {layer}" if layer else label
+                error = _error(result, block, f"{key}.{layer}" if layer else key)
+                output.append(f"    {named:<36}{figure(number):>10} {error}{unit}".rstrip())
     to_open = sorted((f for f in files if f.suffix in OPEN_FIRST), key=lambda f: OPEN_FIRST.index(f.suffix))
     return output + ["", *(f"  open {path}" for path in to_open)] if to_open else output
+
+
+def _error(result: dict[str, Any], block: str, key: str) -> str:
+    """'± 0.0099 ' for a figure whose error was estimated, blank otherwise; aligned where there are any."""
+    errors = result.get("errors") or {}
+    known = errors.get(key if block == "final" else f"{block}.{key}", {}).get("error")
+    text = "" if known is None else f"± {known:.2g}"
+    return f"{text:<10} " if errors else ""
 
 
 def label_and_unit(key: str) -> tuple[str, str]:

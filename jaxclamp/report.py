@@ -9,6 +9,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxclamp.console import label_and_unit
+from jaxclamp.errors import SOURCES
 from jaxclamp.fields import layer_fields
 
 if TYPE_CHECKING:
@@ -105,6 +107,7 @@ def page(result: Result, plates: Iterable[tuple[Plate, bytes]]) -> str:
         _opening(title, content, result),
         figure_section(plates),
         section("Numbers", _numbers(content, [layer.name for layer in result.scene.artery.layers])),
+        section("Numerical errors", _errors(content["errors"])),
         section("Checks", _checks(checks(result))),
         section("Model", _model(content["model"])),
         section("Scene", f"<pre>{escape(dump_scene(result.scene))}</pre>"),
@@ -219,6 +222,30 @@ def _numbers(content: dict[str, Any], layers: list[str]) -> str:
             "artery, and each place stands for its mirror images too.</p>"
         )
     return "\n".join(parts)
+
+
+def _errors(errors: dict[str, dict[str, float | None]] | None) -> str:
+    """Table of the estimated errors by figure and source; nothing if there are none."""
+    if not errors:
+        return ""
+
+    def cells(key: str, e: dict[str, float | None]) -> list[str]:
+        name, _, layer = key.removeprefix("physiological.").partition(".")
+        label, _ = label_and_unit(name)
+        label = f"{label}, in the body" if key.startswith("physiological.") else label
+        signed = lambda v: "–" if v is None else f"{v:+.2g}"  # noqa: E731
+        error = "–" if e["error"] is None else f"± {e['error']:.2g}"
+        sources = [signed(e[source]) for source in SOURCES]
+        return [f"{label}, {layer}" if layer else label, number(e["value"], name), error, *sources]
+
+    head = ["figure", "value", "error", "mesh", "bulk modulus", "contact stiffness", "contact smoothing"]
+    said = (
+        "Estimates of what the discretisation adds to each figure, in its unit: the mesh by a coarser twin, "
+        "the penalties by the solution's derivatives. The error is the sum of their sizes. It does not "
+        "cover the model: material constants, symmetry, friction."
+    )
+    rows = [cells(key, e) for key, e in errors.items()]
+    return f'{table(head, rows)}<p class="faint">{escape(said)}</p>'
 
 
 # --------------------------------------------------------------------------------- checks

@@ -8,6 +8,8 @@ import platform
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jaxclamp.assembly import State
 from jaxclamp.equilibrium import Equilibrium, EquilibriumError
 from jaxclamp.linear_solvers import LinearSolver
@@ -64,6 +66,14 @@ class LinearSolvers:
     physiological: LinearSolver
     """unused until a derivative asks for it"""
 
+    def holding(self, values: np.ndarray) -> LinearSolver:
+        """A solver with the factors of the physiological tangent: one that has them, or after factoring."""
+        if self.stop.holds(values):
+            return self.stop
+        if not self.physiological.holds(values):
+            self.physiological.factor(values)
+        return self.physiological
+
 
 @dataclasses.dataclass(frozen=True)
 class Result:
@@ -76,6 +86,8 @@ class Result:
     solver: dict[str, Any]
     cost: dict[str, Any]
     linear_solvers: LinearSolvers = dataclasses.field(repr=False)
+    errors: dict[str, dict[str, float | None]] | None = None
+    """how far the main figures may be off, see `jaxclamp.errors`; None if it was not asked for"""
 
     def measure(self, measure: Measure) -> float:
         """The value of a measure in internal units (mm, kPa, mN, uJ), from the states at hand.
@@ -178,6 +190,7 @@ class Result:
                 "circumferential_stress_at_P_kPa": base and base.values["circumferential_stress_at_P_kPa"],
             },
             "final": self.final,
+            "errors": self.errors,
             "history": self.history,
             "model": {
                 "symmetry": SYMMETRY,

@@ -6,6 +6,7 @@ is wrong with which key.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,29 @@ def check(scene: Scene) -> None:
     )
     for one in checks:
         one(scene)
+
+
+def check_signs(record: Any, path: str = "") -> None:
+    """Every quantity is finite, and positive where it has to be.
+
+    Less than the ranges of a file: differences, and studies of one's own, may step over their ends.
+    """
+    for field in dataclasses.fields(record):
+        value, name = getattr(record, field.name), schema.join(path, schema.file_key(field))
+        if "range" in field.metadata:
+            interval = field.metadata["range"]
+            numbers = np.atleast_1d(np.asarray(value, float))
+            positive = interval.open_lower and interval.lower == 0.0
+            if not np.all(np.isfinite(numbers)) or (positive and not np.all(numbers > 0.0)):
+                shown = np.asarray(value, float) / UNIT_FACTOR[interval.unit]
+                raise refuse(name, shown.tolist(), str(interval))
+        elif isinstance(value, tuple):
+            parts = [(part, f"{name}[{i}]") for i, part in enumerate(value)]
+            for part, where in parts:
+                if dataclasses.is_dataclass(part):
+                    check_signs(part, where)
+        elif dataclasses.is_dataclass(value):
+            check_signs(value, name)
 
 
 def check_names(scene: Scene) -> None:

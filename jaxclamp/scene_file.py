@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
@@ -18,7 +19,7 @@ from jaxclamp import schema
 from jaxclamp.jaws import Jaw
 from jaxclamp.presets import SceneError, did_you_mean, preset
 from jaxclamp.scene import Artery, MeshSettings, Scene, Stop
-from jaxclamp.scene_checks import check
+from jaxclamp.scene_checks import check, check_signs
 from jaxclamp.schema import BadKey, refuse
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "loads_scene",
     "mesh_for",
     "own_mesh_keys",
+    "require_computable",
     "require_possible",
 ]
 
@@ -60,10 +62,8 @@ def loads_scene(
     for override in overrides:
         _apply(table, override, source)
         _expand(table, source)
-    try:
+    with _refusals(f"{source}{' with overrides' if overrides else ''}"):
         return _scene(table, fidelity)
-    except BadKey as error:
-        raise SceneError(f"{source}{' with overrides' if overrides else ''}: {error}") from None
 
 
 def dump_scene(scene: Scene) -> str:
@@ -82,10 +82,25 @@ def require_possible(scene: Scene) -> None:
 
     Raises SceneError.
     """
-    try:
+    with _refusals("scene"):
         check(schema.read(Scene, schema.table(scene)))
+
+
+def require_computable(scene: Scene) -> None:
+    """Refuse a scene made in Python with a number that is not finite, or not positive where it has to be.
+
+    Raises SceneError.
+    """
+    with _refusals("scene"):
+        check_signs(scene)
+
+
+@contextmanager
+def _refusals(source: str) -> Iterator[None]:
+    try:
+        yield
     except BadKey as error:
-        raise SceneError(f"scene: {error}") from None
+        raise SceneError(f"{source}: {error}") from None
 
 
 def mesh_for(fidelity: str, artery: Artery) -> MeshSettings:

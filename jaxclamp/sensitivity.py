@@ -244,7 +244,7 @@ def _solve(ticket: Any, b: Unknowns, *, transposed: bool) -> Unknowns:
         raise RuntimeError("this equilibrium is no longer kept: differentiate fewer scenes at a time")
     n = len(known.coupling)
     columns = lambda a: np.asarray(a).reshape(-1, n).T  # noqa: E731  (n, n_rhs)
-    solve_0 = partial(_solve_columns, known.solvers.physiological, known.tangents[0])
+    solve_0 = lambda b: _solve_columns(known.solvers.holding(known.tangents[0]), b)  # noqa: E731
     held = b.physiological is None
     if b.stop is None:
         return Unknowns(
@@ -253,7 +253,7 @@ def _solve(ticket: Any, b: Unknowns, *, transposed: bool) -> Unknowns:
             jaw_height=None,
         )
     assert b.jaw_height is not None
-    solve_1 = partial(_solve_columns, known.solvers.stop, known.tangents[1])
+    solve_1 = lambda b: _solve_columns(known.solvers.stop, b, known.tangents[1])  # noqa: E731
     b1, bh = columns(b.stop), np.asarray(b.jaw_height).reshape(-1)
     b0 = np.zeros((n, bh.size)) if held else columns(b.physiological)
     by_body, by_stop, by_jaw = known.rows
@@ -272,12 +272,13 @@ def _solve(ticket: Any, b: Unknowns, *, transposed: bool) -> Unknowns:
     return Unknowns(physiological=base, stop=_rows(z1, b.stop), jaw_height=height)
 
 
-def _solve_columns(solver: LinearSolver, values: Any, b: np.ndarray) -> np.ndarray:
-    """K^-1 b for b (n, n_rhs); zero columns cost nothing."""
+def _solve_columns(solver: LinearSolver, b: np.ndarray, values: Any = None) -> np.ndarray:
+    """K^-1 b for b (n, n_rhs), with the factors at hand or those of `values`; zero columns cost nothing."""
     x = np.zeros_like(b)
     wanted = np.any(b != 0.0, axis=0)
     if np.any(wanted):
-        x[:, wanted] = solver.solve_for(values, np.ascontiguousarray(b[:, wanted]))
+        columns = np.ascontiguousarray(b[:, wanted])
+        x[:, wanted] = solver.solve(columns) if values is None else solver.solve_for(values, columns)
     return x
 
 

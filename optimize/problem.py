@@ -156,6 +156,7 @@ def evaluate(
     design = np.asarray(design, float)
     scene = problem.scene_at(design)
     try:
+        require_possible(scene)
         result = clamp(scene, guess=near)
     except (EquilibriumError, SceneError) as error:
         n = len(problem.measures)

@@ -22,6 +22,7 @@ import numpy as np
 import scipy.stats
 
 from jaxclamp import EquilibriumError, Progress, Result, SceneError, clamp, dump_scene
+from jaxclamp.errors import with_errors
 from jaxclamp.linear_solvers import cores
 from jaxclamp.results import versions
 from optimize.drivers import METHODS, Enough, Target
@@ -76,8 +77,8 @@ class Study:
         """The content of study.json."""
         record = _Record(self.problem, self.method, list(self.evaluations))
         return record.to_dict(
-            start=self.start.final,
-            best=self.best.final,
+            start=self.start.final | {"errors": self.start.errors},
+            best=self.best.final | {"errors": self.best.errors},
             best_design=self.best_design,
             reference=None if self.reference is None else self.reference.final,
             reference_value=None
@@ -463,6 +464,8 @@ def _finish(
     start = first or clamp(problem.scene)
     best, result = _found_cold(record, start)
     reference = None if problem.reference is None else clamp(problem.reference)
+    tell(Progress("verifying", 0.2, "how far the figures may be off"))
+    start, result = with_errors(start), with_errors(result)
     verification = None
     if check_finer_mesh:
         tell(Progress("verifying", 0.3, "on a finer mesh, with stiffer and sharper contact"))

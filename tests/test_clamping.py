@@ -337,3 +337,17 @@ def test_nothing_is_measured_or_differentiated_short_of_the_stop():
         partial.measure(jc.clamp_force())
     with pytest.raises(jc.EquilibriumError):
         jc.value_and_gradient(partial, jc.clamp_force())
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("artery.layers[0].thickness", -0.1, r"artery\.layers\[0\]\.thickness_mm = -0\.1: expected"),
+        ("artery.pressure", float("nan"), r"artery\.pressure_kPa = nan: expected"),
+        ("clamp.jaw.radius", 0.0, r"clamp\.jaw\.radius_mm = 0\.0: expected"),
+        ("contact.stiffness", float("inf"), r"contact\.stiffness_kPa_per_mm = inf: expected"),
+    ],
+)
+def test_nonsense_made_in_python_is_refused(path, value, said):
+    with pytest.raises(jc.SceneError, match=said):
+        jc.clamp(jc.replace(jc.load_scene("human-lad"), path, value))

@@ -34,13 +34,14 @@ LEVEL = {
     "plots": 9,
     "results": 10,
     "clamping": 11,
+    "errors": 12,
     "paraview": 12,
     "sensitivity": 12,
-    "report": 12,
-    "export": 13,
-    "cli": 14,
-    "__init__": 15,
-    "__main__": 15,
+    "report": 13,
+    "export": 14,
+    "cli": 15,
+    "__init__": 16,
+    "__main__": 16,
 }
 
 MODULES = sorted(path.relative_to(PACKAGE).with_suffix("").parts for path in PACKAGE.rglob("*.py"))
