@@ -1,4 +1,4 @@
-"""The command line: `jaxclamp show`, `run`, `optimise` and `presets`.
+"""The command line: `jaxclamp show`, `run`, `optimise`, `accuracy` and `presets`.
 
 Exit codes: 0 done; 2 the input is wrong; 3 no converged solution; 4 the machine refused; 130
 interrupted. What went wrong is one sentence on standard error. Results go to standard output,
@@ -97,7 +97,7 @@ def _refusal(error: Exception) -> tuple[str, int] | None:
         return str(error), WRONG_INPUT
     if (usage := getattr(error, "format_message", None)) is not None:  # of the command itself
         return usage(), WRONG_INPUT
-    if type(error).__name__ == "EquilibriumError":
+    if type(error).__name__ in ("EquilibriumError", "NoReference"):
         return str(error), NOT_CONVERGED
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return (
@@ -205,6 +205,35 @@ def optimise(
         typer.echo("\n".join([asked.title, *found.lines(), "", *(f"  open {path}" for path in files)]))
     if (said := warning(found)) is not None:
         typer.echo(f"jaxclamp: warning: {said}", err=True)
+    return DONE
+
+
+@app.command()
+def accuracy(
+    scene: SceneArgument,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for the tables.", show_default="./SCENE-accuracy"),
+    ] = None,
+    fidelity: FidelityOption = None,
+    overrides: SetOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """What accuracy costs: error against time and memory over mesh, element, penalties and solver."""
+    loaded = _load(scene, fidelity, overrides, quiet)
+    folder = out or Path(f"{Path(scene).stem}-accuracy")
+    _check_folder(folder)
+    from jaxclamp.accuracy import price_list
+    from jaxclamp.price_report import lines, write_prices
+
+    with console.progress(quiet) as progress:
+        prices = price_list(loaded, progress if callable(progress) else None)
+    files = write_prices(prices, folder)
+    if as_json:
+        typer.echo(console.as_json(prices.to_dict()))
+    elif not quiet:
+        typer.echo("\n".join([*lines(prices), "", *(f"  open {path}" for path in files)]))
     return DONE
 
 

@@ -41,8 +41,9 @@ CHANGE = 1e-3
 """relative change of a penalty for its derivative"""
 COARSENINGS = (1.3, 2.0)
 """elements of the scene over elements of its twin, per direction"""
-ORDER, ORDER_OF_A_PEAK = 2.0, 1.0
-"""with which figures converge as the mesh is refined; the place of a true peak wanders from point to point"""
+ORDER, ORDER_AT_A_POINT = 2.0, 1.0
+"""with which figures converge as the mesh is refined; stress at a point, such as P or where it peaks, has
+the cell's constant pressure in it, and the place of a peak wanders from point to point"""
 SOURCES = ("discretisation", "bulk", "contact_stiffness", "contact_smoothing")
 
 Errors = dict[str, dict[str, float | None]]
@@ -119,7 +120,7 @@ def _from_the_mesh(result: Result, values: dict[str, float]) -> dict[str, float 
         twin = figures(solve(scene))
     except EquilibriumError:
         return dict.fromkeys(values)
-    order = lambda key: ORDER_OF_A_PEAK if key.startswith("peak") else ORDER  # noqa: E731
+    order = lambda key: ORDER_AT_A_POINT if "_stress_" in key else ORDER  # noqa: E731
     return {key: (value - twin[key]) / (1.0 - ratio ** order(key)) for key, value in values.items()}
 
 
@@ -127,15 +128,17 @@ def _from_a_penalty(
     result: Result, values: dict[str, float], paths: tuple[str, ...], sign: float
 ) -> dict[str, float | None]:
     """Sign times the derivative of each figure by the logarithm of a penalty's constants."""
-    scene: Any = result.scene
-    for path in paths:
-        scene = replace(scene, path, (1.0 + CHANGE) * _value(scene, path))
+    scene = multiplied(result.scene, paths, 1.0 + CHANGE)
     near = figures(predicted(result, scene))
     slopes = {key: sign * (near[key] - value) / CHANGE for key, value in values.items()}
     return {key: slope if math.isfinite(slope) else None for key, slope in slopes.items()}
 
 
-def _value(scene: Scene, path: str) -> float:
-    if path.startswith("contact."):
-        return float(getattr(scene.contact, path.removeprefix("contact.")))
-    return float(scene.artery.layers[int(path.split("[")[1].split("]")[0])].material.bulk)
+def multiplied(scene: Scene, paths: tuple[str, ...], factor: float) -> Scene:
+    """A scene with the penalties at some paths (of layers' bulk moduli, of contact) multiplied."""
+    for path in paths:
+        owner: Any = scene.contact
+        if path.startswith("artery"):
+            owner = scene.artery.layers[int(path.split("[")[1].split("]")[0])].material
+        scene = replace(scene, path, factor * float(getattr(owner, path.rpartition(".")[2])))
+    return scene

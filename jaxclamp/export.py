@@ -49,7 +49,8 @@ def write_outputs(
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=STAGING, dir=folder) as staging:
             written = list(_write_all(result, Path(staging), tell))
-            files = _into_place(Path(staging), folder, written)
+            files = into_place(Path(staging), folder, written)
+            _remove_old(folder, files)
     except BaseException:
         for path in missing:
             with suppress(OSError):
@@ -84,8 +85,8 @@ def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) 
     yield final
 
 
-def _into_place(staging: Path, folder: Path, written: list[Path]) -> list[Path]:
-    """Rename the finished files into the folder and remove what an earlier result left over."""
+def into_place(staging: Path, folder: Path, written: list[Path]) -> list[Path]:
+    """Rename finished files from a temporary folder into their own; returns them there."""
     for path in written:
         with path.open("r+b") as file:  # a disk that fills up late says so here
             os.fsync(file.fileno())
@@ -94,10 +95,14 @@ def _into_place(staging: Path, folder: Path, written: list[Path]) -> list[Path]:
         parent.mkdir(exist_ok=True)
     for name in names:
         os.replace(staging / name, folder / name)
-    for old in _own_files(folder):  # of an earlier result with more states
-        if old.relative_to(folder) not in names:
-            old.unlink()
     return [folder / name for name in names]
+
+
+def _remove_old(folder: Path, files: list[Path]) -> None:
+    """Remove what an earlier result with more states left over."""
+    for old in _own_files(folder):
+        if old not in files:
+            old.unlink()
 
 
 def _own_files(folder: Path) -> Iterator[Path]:

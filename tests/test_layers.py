@@ -37,11 +37,13 @@ LEVEL = {
     "errors": 12,
     "paraview": 12,
     "sensitivity": 12,
+    "accuracy": 13,
     "report": 13,
     "export": 14,
-    "cli": 15,
-    "__init__": 16,
-    "__main__": 16,
+    "price_report": 15,
+    "cli": 16,
+    "__init__": 17,
+    "__main__": 17,
 }
 
 MODULES = sorted(path.relative_to(PACKAGE).with_suffix("").parts for path in PACKAGE.rglob("*.py"))

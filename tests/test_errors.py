@@ -1,0 +1,120 @@
+"""The errors that are reported: against exact tubes, against harder penalties, and where they are shown."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxclamp as jc
+from jaxclamp.clamping import inflate
+from jaxclamp.errors import SOURCES, coarser, estimate, figures, multiplied, with_errors
+from test_tube import drawn
+from tube import SEED, SEED_PRESSURE, SEED_STRETCH, Incompressible
+from walks import mesh, tube_scene
+
+FACTOR = 3.0
+"""an estimate is good if it is within this factor of the true error"""
+TUBE = mesh("q1p0", 10, 3, (5, 3), axial_grading=0.0)
+SMOOTH = "smooth_peak_axial_stress_kPa.media"
+SMALL = ["mesh.circumferential=6", "mesh.axial=8", "mesh.radial=[2, 2]"]
+
+
+def ratios(case) -> list[float]:
+    """Estimated over true error of lumen radius and axial stress at P, the exact ones by quadrature."""
+    sectors, pressure, stretch = case
+    found = estimate(inflate(tube_scene(sectors, pressure, stretch, TUBE, bulk=1e4)))
+    tube = Incompressible(sectors, pressure, stretch)
+    exact = {
+        "physiological.lumen_radius_mm": tube.inner_radius,
+        "physiological.axial_stress_at_P_kPa": tube.profile(0, [sectors[0].inner_radius]).axial[0],
+    }
+    return [found[key]["error"] / abs(found[key]["value"] - value) for key, value in exact.items()]
+
+
+def share_of_good(cases) -> float:
+    every = [ratio for case in cases for ratio in ratios(case)]
+    return float(np.mean([1.0 / FACTOR <= ratio <= FACTOR for ratio in every]))
+
+
+def test_estimates_of_tubes_are_within_a_factor_of_three():
+    """In nine cases of ten, here of ten: the tube of 2002 and four that nobody tuned to."""
+    assert share_of_good([(SEED, SEED_PRESSURE, SEED_STRETCH), *map(drawn, range(4))]) >= 0.9
+
+
+@pytest.mark.slow
+def test_estimates_of_many_tubes_are_within_a_factor_of_three():
+    assert share_of_good(map(drawn, range(4, 24))) >= 0.9
+
+
+@pytest.fixture(scope="module")
+def clamped() -> jc.Result:
+    return with_errors(jc.clamp(jc.load_scene("human-lad", SMALL)))
+
+
+@pytest.mark.parametrize(
+    ("source", "paths", "factor"),
+    [
+        ("bulk", ("artery.layers[0].material.bulk", "artery.layers[1].material.bulk"), 100.0),
+        ("contact_stiffness", ("contact.stiffness",), 20.0),
+    ],
+)
+def test_what_a_penalty_adds_is_what_a_harder_one_takes_away(clamped, source, paths, factor):
+    """Against solutions with a penalty many times as hard. (Contact falls off more slowly than 1/stiffness.)"""
+    harder = figures(jc.clamp(multiplied(clamped.scene, paths, factor), guess=clamped))
+    compared = 0
+    for key in ("jaw_travel_mm", "lumen_width_mm", "axial_stress_at_P_kPa", SMOOTH):
+        found = clamped.errors[key]
+        taken = found["value"] - harder[key]
+        if abs(taken) > 1e-3 * abs(found["value"]):
+            assert 1.0 / FACTOR <= found[source] / taken <= FACTOR, key
+            compared += 1
+    assert compared >= 3
+
+
+@pytest.mark.slow
+def test_estimates_at_the_stop_are_within_a_factor_of_three(clamped):
+    """Against twice the elements in each direction, extrapolated, and the penalties' parts taken off."""
+    scene = clamped.scene
+    fine = dataclasses.replace(scene.mesh, circumferential=12, axial=16, radial=(4, 4))
+    finer = dataclasses.replace(scene.mesh, circumferential=18, axial=24, radial=(6, 6))
+    two, three = (figures(jc.clamp(dataclasses.replace(scene, mesh=m))) for m in (fine, finer))
+    good = []
+    for key, found in clamped.errors.items():
+        if "adventitia" in key:
+            continue  # its peak at the fold is resolved by none of these meshes
+        limit = three[key] + (three[key] - two[key]) * (1 / 9) / (1 / 4 - 1 / 9)
+        exact = limit - sum(found[source] for source in SOURCES[1:])
+        good.append(1.0 / FACTOR <= found["error"] / abs(found["value"] - exact) <= FACTOR)
+    assert np.mean(good) >= 0.9, dict(zip(clamped.errors, good, strict=False))
+
+
+def test_an_error_is_the_sum_of_its_sources(clamped):
+    for found in clamped.errors.values():
+        assert found["error"] == pytest.approx(sum(abs(found[source]) for source in SOURCES))
+    assert clamped.to_dict()["errors"] == clamped.errors
+
+
+def test_a_twin_is_coarser_in_all_directions():
+    settings = jc.load_scene("human-lad").mesh
+    coarse, ratio = coarser(settings)
+    assert coarse.circumferential < settings.circumferential
+    assert coarse.axial < settings.axial
+    assert all(a < b for a, b in zip(coarse.radial, settings.radial, strict=True))
+    assert 1.3 <= ratio <= 2.0
+
+
+def test_without_a_twin_the_error_is_not_known(clamped, monkeypatch):
+    def refuse(scene):
+        raise jc.EquilibriumError("clamping", "somewhere", Failure("no"), "nothing")
+
+    monkeypatch.setattr("jaxclamp.errors.clamp", refuse)
+    found = estimate(clamped)["clamp_force_N"]
+    assert found["discretisation"] is None
+    assert found["error"] is None
+    assert found["bulk"] == pytest.approx(clamped.errors["clamp_force_N"]["bulk"])
+
+
+class Failure(Exception):
+    residual, J_min = float("nan"), float("nan")
