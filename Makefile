@@ -34,8 +34,9 @@ lint: $(READY)
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+# two processes, a file of tests to each at a time: files share compiled programs and solutions
 pytest: $(READY)
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses 2 --dist loadfile
 
 slow: $(READY)
 	$(BIN)/pytest -m slow

@@ -259,12 +259,17 @@ def presets(
 
 
 def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:
-    from jaxclamp.scene_file import load_scene, own_mesh_keys
+    from jaxclamp.scene_file import EXPECTED_ERRORS, load_scene, own_mesh_keys
 
     loaded = load_scene(scene, overrides or (), fidelity or "standard")
-    if fidelity is not None and not quiet and (own := own_mesh_keys(scene)):
+    if fidelity is None or quiet:
+        return loaded
+    if own := own_mesh_keys(scene):
         keys = ", ".join(f"mesh.{key}" for key in own)
         typer.echo(f"note: {scene} sets {keys} itself; --fidelity {fidelity} leaves that as it is", err=True)
+    else:
+        errors = ", ".join(f"{error:.1%} in the {name}" for name, error in EXPECTED_ERRORS[fidelity].items())
+        typer.echo(f"note: --fidelity {fidelity}: expect errors of about {errors}", err=True)
     return loaded
 
 

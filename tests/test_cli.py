@@ -15,6 +15,7 @@ import pytest
 from jaxclamp.cli import main
 from jaxclamp.equilibrium import EquilibriumError, NotConverged
 from jaxclamp.presets import presets
+from jaxclamp.scene_file import mesh_for
 
 FIGURES = {
     "title": "Human LAD",
@@ -92,6 +93,9 @@ def engine(monkeypatch, tmp_path):
     fake = Engine()
     clamping, export = types.ModuleType("jaxclamp.clamping"), types.ModuleType("jaxclamp.export")
     clamping.clamp, export.write_outputs = fake.clamp, fake.write_outputs
+    errors = types.ModuleType("jaxclamp.errors")
+    errors.with_errors = lambda result: result
+    monkeypatch.setitem(sys.modules, "jaxclamp.errors", errors)
     monkeypatch.setattr("jaxclamp.model.describe", fake.describe)
     monkeypatch.setitem(sys.modules, "jaxclamp.clamping", clamping)
     monkeypatch.setitem(sys.modules, "jaxclamp.export", export)
@@ -150,8 +154,10 @@ def test_run_passes_overrides_and_fidelity_on(engine, capsys):
     code, _, err = call(capsys, "run", "human-lad", *options)
     assert code == 0
     (scene,) = engine.scenes
-    assert (scene.clamp.jaw.radius, scene.stop.travel, scene.mesh.axial) == (1.5, 2.0, 10)
-    assert "note:" not in err
+    assert (scene.clamp.jaw.radius, scene.stop.travel) == (1.5, 2.0)
+    assert scene.mesh == mesh_for("draft", scene.artery)
+    assert "note: --fidelity draft: expect errors of about" in err
+    assert "% in the jaw force" in err
 
 
 def test_run_notes_a_fidelity_that_the_scene_overrules(engine, capsys, tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
+from jaxclamp.accuracy import REFERENCE_MESHES, richardson, scaled
 from jaxclamp.clamping import inflate
 from jaxclamp.errors import SOURCES, coarser, estimate, figures, multiplied, with_errors
 from test_tube import drawn
@@ -18,7 +19,6 @@ FACTOR = 3.0
 """an estimate is good if it is within this factor of the true error"""
 TUBE = mesh("q1p0", 10, 3, (5, 3), axial_grading=0.0)
 SMOOTH = "smooth_peak_axial_stress_kPa.media"
-SMALL = ["mesh.circumferential=6", "mesh.axial=8", "mesh.radial=[2, 2]"]
 
 
 def ratios(case) -> list[float]:
@@ -74,21 +74,22 @@ def test_what_a_penalty_adds_is_what_a_harder_one_takes_away(clamped, source, pa
 
 
 @pytest.mark.slow
-def test_estimates_at_the_stop_are_within_a_factor_of_three():
-    """Against twice and thrice the elements in each direction, extrapolated, less the penalties' parts."""
-    clamped = with_errors(jc.clamp(jc.load_scene("human-lad", SMALL)))
+def test_estimates_at_the_stop_are_no_underestimates(clamped):
+    """Against three meshes, extrapolated, less the penalties' parts; there is no exact solution.
+
+    None is less than a third of the error; where sources cancel each other, their sum is too much.
+    """
     scene = clamped.scene
-    fine = dataclasses.replace(scene.mesh, circumferential=12, axial=16, radial=(4, 4))
-    finer = dataclasses.replace(scene.mesh, circumferential=18, axial=24, radial=(6, 6))
-    two, three = (figures(jc.clamp(dataclasses.replace(scene, mesh=m))) for m in (fine, finer))
-    good = []
-    for key, found in clamped.errors.items():
-        if "adventitia" in key:
-            continue  # its peak at the fold is resolved by none of these meshes
-        limit = three[key] + (three[key] - two[key]) * (1 / 9) / (1 / 4 - 1 / 9)
-        exact = limit - sum(found[source] for source in SOURCES[1:])
-        good.append(1.0 / FACTOR <= found["error"] / abs(found["value"] - exact) <= FACTOR)
-    assert np.mean(good) >= 0.9, dict(zip(clamped.errors, good, strict=False))
+    meshes = [scaled(scene.mesh, factor) for factor in REFERENCE_MESHES]
+    found = [clamped, *(jc.clamp(dataclasses.replace(scene, mesh=m)) for m in meshes[1:])]
+    sizes = [result.model.mesh.n_cells ** (-1.0 / 3.0) for result in found]
+    ratios = {}
+    for key, known in clamped.errors.items():
+        limit = richardson(sizes, [figures(result)[key] for result in found]).value
+        exact = limit - sum(known[source] for source in SOURCES[1:])
+        ratios[key] = known["error"] / abs(known["value"] - exact)
+    assert min(ratios.values()) >= 1.0 / FACTOR, ratios
+    assert np.mean([ratio <= FACTOR for ratio in ratios.values()]) >= 0.8, ratios
 
 
 def test_an_error_is_the_sum_of_its_sources(clamped):

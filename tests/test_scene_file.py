@@ -415,7 +415,7 @@ def test_numbers_become_floats_in_internal_units():
 
 @pytest.mark.parametrize(
     ("fidelity", "counts"),
-    [("draft", (8, 10, (3, 2))), ("standard", (10, 15, (5, 3))), ("reference", (20, 30, (10, 6)))],
+    [("draft", (7, 10, (3, 2))), ("standard", (10, 15, (5, 3))), ("reference", (20, 30, (10, 6)))],
 )
 def test_fidelity_chooses_the_mesh_where_the_scene_does_not(fidelity, counts):
     mesh = load_scene("human-lad", fidelity=fidelity).mesh
