@@ -18,6 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
 
@@ -131,7 +132,11 @@ def counts(mesh: MeshSettings) -> str:
 def solve(rung: Rung) -> Price:
     """Solve a variant in this process."""
     try:
-        clamp(dataclasses.replace(rung.scene, stop=OcclusionStop(occlusion=WARM_UP)))
+        clamp(
+            dataclasses.replace(
+                rung.scene, stop=OcclusionStop(kind="occlusion", occlusion=jnp.asarray(WARM_UP))
+            )
+        )
         start = time.perf_counter()
         result = clamp(rung.scene)
         seconds = time.perf_counter() - start
