@@ -108,6 +108,14 @@ def label_and_unit(key: str) -> tuple[str, str]:
     return (name.replace("_", " "), UNITS[unit]) if name and unit in UNITS else (key.replace("_", " "), "")
 
 
+def name_and_unit(key: str) -> tuple[str, str]:
+    """'physiological.lumen_radius_mm' -> ('lumen radius, in the body', 'mm'); a layer's name goes behind."""
+    name, _, layer = key.removeprefix("physiological.").partition(".")
+    label, unit = label_and_unit(name)
+    in_body = "in the body" if key.startswith("physiological.") else ""
+    return ", ".join(part for part in (label, in_body, layer) if part), unit
+
+
 def figure(value: Any) -> str:
     """A number to four digits, '-' for none."""
     if isinstance(value, float):

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from jaxclamp.accuracy import GRADIENT, Price, PriceList, machine
-from jaxclamp.console import as_json, label_and_unit
+from jaxclamp.console import as_json, name_and_unit
 from jaxclamp.errors import SOURCES
 from jaxclamp.export import STAGING, into_place
 from jaxclamp.plots.accuracy import Panel, plot_prices
@@ -81,7 +81,7 @@ def markdown(prices: PriceList) -> str:
     sources = [bar(["figure", "exact", *(name.replace("_", " ") for name in SOURCES)])]
     sources.append(bar(["---", *["---:"] * (len(SOURCES) + 1)]))
     for key, found in prices.sources.items():
-        name, unit = label_and_unit(key.partition(".kPa")[0])
+        name, unit = name_and_unit(key)
         parts = [found[source] for source in SOURCES]
         cells = ["-" if part is None else f"{part:+.2g}" for part in parts]
         sources.append(bar([f"{name} ({unit})" if unit else name, f"{prices.exact[key]:.5g}", *cells]))

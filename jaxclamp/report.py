@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxclamp.console import label_and_unit
+from jaxclamp.console import name_and_unit
 from jaxclamp.errors import SOURCES
 from jaxclamp.fields import layer_fields
 
@@ -230,13 +230,11 @@ def _errors(errors: dict[str, dict[str, float | None]] | None) -> str:
         return ""
 
     def cells(key: str, e: dict[str, float | None]) -> list[str]:
-        name, _, layer = key.removeprefix("physiological.").partition(".")
-        label, _ = label_and_unit(name)
-        label = f"{label}, in the body" if key.startswith("physiological.") else label
+        label, unit = name_and_unit(key)
         signed = lambda v: "–" if v is None else f"{v:+.2g}"  # noqa: E731
         error = "–" if e["error"] is None else f"± {e['error']:.2g}"
         sources = [signed(e[source]) for source in SOURCES]
-        return [f"{label}, {layer}" if layer else label, number(e["value"], name), error, *sources]
+        return [label, number(e["value"], f"_{unit}"), error, *sources]
 
     head = ["figure", "value", "error", "mesh", "bulk modulus", "contact stiffness", "contact smoothing"]
     said = (

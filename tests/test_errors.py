@@ -10,7 +10,9 @@ import pytest
 import jaxclamp as jc
 from jaxclamp.accuracy import REFERENCE_MESHES, richardson, scaled
 from jaxclamp.clamping import inflate
+from jaxclamp.console import summary
 from jaxclamp.errors import SOURCES, coarser, estimate, figures, multiplied, with_errors
+from jaxclamp.report import page
 from test_tube import drawn
 from tube import SEED, SEED_PRESSURE, SEED_STRETCH, Incompressible
 from walks import mesh, tube_scene
@@ -120,3 +122,13 @@ def test_without_a_twin_the_error_is_not_known(clamped, monkeypatch):
 
 class Failure(Exception):
     residual, J_min = float("nan"), float("nan")
+
+
+def test_the_report_and_the_terminal_show_the_errors(clamped):
+    text = page(clamped, [])
+    assert "Numerical errors" in text
+    assert "lumen radius, in the body" in text
+    assert "smooth peak axial stress, media" in text
+    force = next(line for line in summary(clamped.to_dict(), []) if "clamp force" in line)
+    assert "0.4776 ± 0.0099" in force
+    assert force.endswith("N")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from matplotlib.ticker import NullFormatter
+
 from jaxclamp.plots.style import FAINT, INK, LAYER_EDGES, SMALL, Picture, dress
 
 MARKERS = "osD^v<>P*Xph"
@@ -42,6 +44,8 @@ def plot_prices(panels: list[Panel]) -> Picture:
             )
         axes.set_xscale("log")
         axes.set_yscale("log")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.xaxis.set_minor_formatter(NullFormatter())
         dress(axes, "time of one clamping (s)", "" if number % COLUMNS else "relative error", panel.label)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(
