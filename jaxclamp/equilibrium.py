@@ -39,6 +39,8 @@ LARGEST_MOVE = 0.25
 """a Newton correction moves no node further than this part of the lumen radius"""
 LARGEST_GROWTH = 1e2
 """a Newton step may leave an imbalance of up to so many times the support reactions, or the one before"""
+LARGEST_FORCE = 1e13
+"""stiffness times position, mN, beyond which a wall has exploded: no rounding excuses its residual then"""
 ROUND_OFF = 2.0**-52
 """a residual that this relative change of the positions would make is rounding: an unloaded, stress-free
 artery has no reactions to measure its residual by, and a bulk modulus may be 1e6 times the stress"""
@@ -203,7 +205,9 @@ def residual_norm(lin: Linearisation) -> float:
 def _converged(system: System, state: State, lin: Linearisation, closing_error: float) -> bool:
     """The forces balance to the tolerance or to rounding, cells have their volume, the closing holds."""
     free = np.asarray(state.x).reshape(-1)[np.asarray(system.body.topology.free)]
-    rounding = ROUND_OFF * float(np.linalg.norm(lin.values[system.diagonal] * free))
+    forces = lin.values[system.diagonal] * free
+    sane = float(np.max(np.abs(forces), initial=0.0)) < LARGEST_FORCE
+    rounding = ROUND_OFF * float(np.linalg.norm(forces)) if sane else 0.0
     small = residual_norm(lin) <= max(system.tolerance * float(lin.reactions), rounding)
     closed = float(lin.volume_error) <= VOLUME_TOLERANCE and abs(closing_error) <= 1e-9 * system.length
     return small and closed
