@@ -1,7 +1,7 @@
 """The price list: what accuracy costs, over the numerical choices of a scene.
 
 One choice at a time is varied around the scene's own (`ladder`); each variant is solved in a process of
-its own, so that its memory is its own (`measure`); errors are against a reference (`reference`): the
+its own, so that its memory is its own (`measure`); errors are against a reference (`price_list`): the
 scene's figures extrapolated over three meshes (Richardson), less what its penalties add (`errors`).
 """
 
@@ -14,7 +14,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from typing import Any
 
 import jax
@@ -202,7 +202,8 @@ def measure(rungs: list[Rung], tell: Callable[[Progress], Any]) -> list[Price]:
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             try:
                 found.append(pool.submit(solve, rung).result())
-            except (MemoryError, OSError, RuntimeError) as error:  # killed for its memory, too
+            except (MemoryError, OSError, BrokenExecutor, jax.errors.JaxRuntimeError) as error:
+                # out of memory, in one of the ways in which that shows
                 found.append(Price(rung.group, rung.setting, None, f"the machine refused: {error}"))
     tell(Progress("accuracy", 1.0, f"{len(rungs)} variants"))
     return found
@@ -278,7 +279,7 @@ class PriceList:
             "machine": machine(),
             "versions": versions(),
             "reference": {
-                key: {"value": self.exact[key], **dataclasses.asdict(limit)}
+                key: {"exact": self.exact[key], "limit_of_meshes": dataclasses.asdict(limit)}
                 for key, limit in self.limits.items()
             },
             "sources": self.sources,
@@ -296,7 +297,10 @@ def machine() -> str:
 
 
 def price_list(scene: Scene, progress: Callable[[Progress], Any] | None = None) -> PriceList:
-    """Measure what accuracy costs for a scene. Raises EquilibriumError if the scene has no solution."""
+    """Measure what accuracy costs for a scene.
+
+    Raises EquilibriumError if the scene has no solution, NoReference if a finer mesh has none.
+    """
     own = clamp(scene)
     sources = estimate(own)
     prices = measure(ladder(scene), progress or (lambda event: None))

@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxclamp.clamping import clamp, inflate, predicted
 from jaxclamp.equilibrium import EquilibriumError
+from jaxclamp.linear_solvers import Singular
 from jaxclamp.results import Result
 from jaxclamp.scene import MeshSettings, Scene, replace
 
@@ -127,9 +128,15 @@ def _from_the_mesh(result: Result, values: dict[str, float]) -> dict[str, float 
 def _from_a_penalty(
     result: Result, values: dict[str, float], paths: tuple[str, ...], sign: float
 ) -> dict[str, float | None]:
-    """Sign times the derivative of each figure by the logarithm of a penalty's constants."""
+    """Sign times the derivative of each figure by the logarithm of a penalty's constants; None if refused."""
     scene = multiplied(result.scene, paths, 1.0 + CHANGE)
-    near = figures(predicted(result, scene))
+    try:
+        near = figures(predicted(result, scene))
+    except (
+        EquilibriumError,
+        Singular,
+    ):  # the result stays, its error is not known
+        return dict.fromkeys(values)
     slopes = {key: sign * (near[key] - value) / CHANGE for key, value in values.items()}
     return {key: slope if math.isfinite(slope) else None for key, slope in slopes.items()}
 

@@ -93,10 +93,7 @@ def markdown(prices: PriceList) -> str:
             "",
             *table,
             "",
-            *(
-                f"- {note.lstrip('* ')}" if not note.startswith("*") else f"- \\{note}"
-                for note in notes(prices)
-            ),
+            *(f"- {note.replace('*', chr(92) + '*')}" for note in notes(prices)),
             "",
             "## Where the error of the scene itself comes from",
             "",

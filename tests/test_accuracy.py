@@ -77,6 +77,9 @@ def test_tables_and_files(tmp_path):
     assert float(table[1]["error of physiological.lumen_radius_mm"]) == pytest.approx(0.01)
     assert table[3]["seconds"] == "nan"
     written = json.loads((tmp_path / "new" / "accuracy.json").read_text())
+    reference = written["reference"]["physiological.lumen_radius_mm"]
+    assert reference["exact"] == 10.0
+    assert reference["limit_of_meshes"]["order"] == pytest.approx(2.0)
     assert written["front"]["physiological.lumen_radius_mm"] == ["mesh: coarse", "mesh: fine"]
     assert (tmp_path / "new" / "accuracy.png").read_bytes().startswith(b"\x89PNG")
 

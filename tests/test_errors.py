@@ -120,6 +120,19 @@ def test_without_a_twin_the_error_is_not_known(clamped, monkeypatch):
     assert found["bulk"] == pytest.approx(clamped.errors["clamp_force_N"]["bulk"])
 
 
+def test_a_prediction_that_is_refused_leaves_the_error_unknown(clamped, monkeypatch):
+    """A result just inside what is covered is not lost for the sake of its error."""
+
+    def refuse(result, scene):
+        raise jc.EquilibriumError("clamping", "somewhere", Failure("no"), "nothing")
+
+    monkeypatch.setattr("jaxclamp.errors.predicted", refuse)
+    found = estimate(clamped)["clamp_force_N"]
+    assert found["bulk"] is None
+    assert found["error"] is None
+    assert found["discretisation"] == pytest.approx(clamped.errors["clamp_force_N"]["discretisation"])
+
+
 class Failure(Exception):
     residual, J_min = float("nan"), float("nan")
 
