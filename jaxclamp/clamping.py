@@ -36,9 +36,11 @@ from jaxclamp.linear_solvers import LinearSolver
 from jaxclamp.measures import PARTS_OF_A_JAW, Report, observe
 from jaxclamp.meshes import closed_positions
 from jaxclamp.model import Model, build_model, same_kind
+from jaxclamp.pytree import shape_of
 from jaxclamp.results import Kept, LinearSolvers, Result, work_balance
 from jaxclamp.scene import ForceStop, OcclusionStop, Scene, TravelStop
 from jaxclamp.scene_file import require_computable
+from jaxclamp.transfer import transferred
 
 FIRST_TOUCH = 0.02
 """the first closing step, as part of the outer radius: enough to bring points into contact"""
@@ -382,7 +384,7 @@ def clamp(
 ) -> Result:
     """Clamp the artery of a scene to its stop; every converged state.
 
-    guess: the result of a neighbouring scene (same mesh and laws) to start from
+    guess: the result of a neighbouring scene to start from: the same layers, laws and kind of jaw, any mesh
     progress: True for lines on standard error, or a function of `Progress`
 
     Raises EquilibriumError if the stop is not reached; its `result` keeps what did converge.
@@ -408,12 +410,12 @@ def _clamp(
     start = time.perf_counter()
     require_computable(scene)
     model = build_model(scene, None if guess is None else guess.model)
-    neighbour = guess is not None and guess.converged and same_kind(scene, guess.scene)
-    warm = guess if neighbour else None
-    same_solver = warm is not None and warm.scene.solver == scene.solver
-    walk = _Walk(model, _reporter(progress), start, warm.linear_solvers if warm and same_solver else None)
+    warm = None if guess is None else _on_mesh_of(model, guess)
+    carried_over = warm is not guess
+    keep_solver = warm is not None and not carried_over and warm.scene.solver == scene.solver
+    walk = _Walk(model, _reporter(progress), start, warm.linear_solvers if warm and keep_solver else None)
     try:
-        if warm is not None and _warm(walk, warm, to_stop):
+        if warm is not None and _warm(walk, warm, to_stop, carried_over):
             return _result(walk, None)
         walk.states.clear()
         physiological = walk.physiological(walk.load_free(None), None)
@@ -425,15 +427,35 @@ def _clamp(
     return _result(walk, None)
 
 
-def _warm(walk: _Walk, guess: Result, to_stop: bool) -> bool:
+def _on_mesh_of(model: Model, guess: Result) -> Result | None:
+    """The guess, its states carried over if it has another mesh; None if it is no neighbour."""
+    scene = dataclasses.replace(guess.scene, mesh=model.scene.mesh)
+    if not guess.converged or not same_kind(model.scene, scene):
+        return None
+    if _equal(model.scene.mesh, guess.scene.mesh):
+        return guess
+    like = build_model(scene, model)
+
+    def carried_over(kept: Kept) -> Kept:
+        state = transferred(kept.state, guess.model, like)
+        return dataclasses.replace(kept, equilibrium=dataclasses.replace(kept.equilibrium, state=state))
+
+    # load-free, physiological, and the last one if that is another
+    ends = [*guess.states[:2], *guess.states[2:][-1:]]
+    return dataclasses.replace(guess, model=like, states=tuple(map(carried_over, ends)))
+
+
+def _warm(walk: _Walk, guess: Result, to_stop: bool, carried_over: bool) -> bool:
     """Solve from a neighbour's states, over scenes in between if the way is long.
+
+    carried_over: the states are of another mesh and no equilibria of this one
 
     False if that does not work and a cold start is needed.
     """
     target, first, last = walk.model, guess.physiological, guess.states[-1]
     assert guess.load_free is not None
     assert first is not None
-    if _same_artery(target.scene, guess.scene):
+    if not carried_over and _same_artery(target.scene, guess.scene):
         walk.states[:] = [guess.load_free, first]
         walk.refer_to(first.equilibrium)
         walk.system.length = walk.lumen_radius
@@ -448,7 +470,7 @@ def _warm(walk: _Walk, guess: Result, to_stop: bool) -> bool:
     if last.stage != "clamping":
         walk.close(walk.states[-1].equilibrium)
         return True
-    found = _warm_stop(walk, guess, last.equilibrium)
+    found = _warm_stop(walk, guess, last.equilibrium, carried_over)
     try:
         if found is not None:
             walk.keep("clamping", found, 1.0, "from a neighbouring solution")
@@ -459,13 +481,23 @@ def _warm(walk: _Walk, guess: Result, to_stop: bool) -> bool:
 
 def _same_artery(a: Scene, b: Scene) -> bool:
     """True if the states without the clamp are the same, to no less accuracy than b's."""
-    pairs = zip(*map(jax.tree_util.tree_leaves, ((a.artery, a.mesh), (b.artery, b.mesh))), strict=True)
-    equal = all(np.array_equal(u, v) for u, v in pairs)
+    equal = _equal(a.artery, b.artery) and _equal(a.mesh, b.mesh)
     return equal and b.solver.tolerance <= a.solver.tolerance
 
 
-def _warm_stop(walk: _Walk, guess: Result, last: Equilibrium) -> Equilibrium | None:
-    """The state at the stop, followed from a neighbour's with as few scenes in between as it takes."""
+def _equal(a: Any, b: Any) -> bool:
+    """True if two records have the same static choices and the same floats."""
+    floats = zip(*map(jax.tree_util.tree_leaves, (a, b)), strict=True)
+    return bool(shape_of(a, np.shape) == shape_of(b, np.shape)) and all(
+        np.array_equal(u, v) for u, v in floats
+    )
+
+
+def _warm_stop(walk: _Walk, guess: Result, last: Equilibrium, carried_over: bool) -> Equilibrium | None:
+    """The state at the stop, followed from a neighbour's with as few scenes in between as it takes.
+
+    A state carried over from another mesh that is too far off is first settled under its own jaw.
+    """
     target, base = walk.model, walk.states[-1].equilibrium
     radii = walk.lumen_radius, walk.outer_radius
     old = guess.physiological
@@ -487,6 +519,14 @@ def _warm_stop(walk: _Walk, guess: Result, last: Equilibrium) -> Equilibrium | N
             last = newton(walk.system, start, walk.step(closing))
             reached = t
         except NotConverged:
+            if carried_over:
+                walk.use(build_model(guess.scene, target))
+                try:
+                    last = walk.settle(last.state, walk.held(float(last.state.jaw_height)))
+                except NotConverged:
+                    break
+                carried_over = False
+                continue
             step = 0.5 * step
             if step < SMALLEST_SHARE:
                 break

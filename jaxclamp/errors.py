@@ -116,9 +116,9 @@ def _from_the_mesh(result: Result, values: dict[str, float]) -> dict[str, float 
     """Figure less the figure on an infinitely fine mesh; None where the twin has no equilibrium."""
     mesh, ratio = coarser(result.scene.mesh)
     scene = dataclasses.replace(result.scene, mesh=mesh)
-    solve: Callable[[Scene], Result] = clamp if result.states[-1].stage == "clamping" else inflate
+    solve: Callable[..., Result] = clamp if result.states[-1].stage == "clamping" else inflate
     try:
-        twin = figures(solve(scene))
+        twin = figures(solve(scene, guess=result))
     except EquilibriumError:
         return dict.fromkeys(values)
     order = lambda key: ORDER_AT_A_POINT if "_stress_" in key else ORDER  # noqa: E731

@@ -10,6 +10,7 @@ circumferential and radial lines: the wall carries these directions with it when
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -253,7 +254,7 @@ def _lumen_and_contact(body: Body, state: State, marks: Landmarks) -> Report:
     }
 
 
-@jax.jit
+@partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 def _balance(body: Body, state: State, pressure: Array, marks: Landmarks) -> Report:
     """Energy, jaw force, and the checks of equilibrium.
 
@@ -261,6 +262,8 @@ def _balance(body: Body, state: State, pressure: Array, marks: Landmarks) -> Rep
     that was solved. The balance is that of the modelled part along y: the cut through the wall, the
     pressure on the lumen's projection and the contact of the inner walls against the force on the jaw;
     relative to the largest of them, or, where all vanish, to a thousandth of the wall's other forces.
+
+    Called once a state, it is compiled for a short compilation rather than for speed.
     """
     energy, elastic = jax.value_and_grad(potential, argnums=1)(body, state.x, state.jaw_height, 0.0)
     volume, swelling = jax.value_and_grad(lumen_volume, argnums=1)(body, state.x)

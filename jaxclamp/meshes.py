@@ -140,7 +140,7 @@ def _graded(n: int, grading: Array) -> Array:
     return jnp.where(curved, jnp.expm1(g * s) / jnp.expm1(g), straight_to_second_order)
 
 
-def _angles(mesh: Mesh, settings: MeshSettings) -> Array:
+def angles(mesh: Mesh, settings: MeshSettings) -> Array:
     """Angle of each circumferential grid line in the closed tube, rad, (n_c,)."""
     return 0.5 * jnp.pi * _graded(mesh.grid[1], settings.circumferential_grading)
 
@@ -163,7 +163,7 @@ def sector_share(opening_angle: Array) -> Array:
 def stress_free_positions(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """Position of each cell's nodes in the open sector of its layer, mm, (3, n_en, n_cells)."""
     n_r, n_c, _ = mesh.grid
-    angle = _angles(mesh, settings)[mesh.cells // n_r % n_c]
+    angle = angles(mesh, settings)[mesh.cells // n_r % n_c]
     height = _heights(mesh, settings, artery)[mesh.cells // (n_r * n_c)]
     radius, opened = [], []
     for layer, (first, last) in zip(artery.layers, mesh.layer_cells, strict=True):
@@ -195,6 +195,6 @@ def closed_radii(mesh: Mesh, artery: Artery) -> Array:
 def closed_positions(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """A guess of the load-free position of each node, mm, (n_nodes, 3)."""
     z, theta, r = jnp.meshgrid(
-        _heights(mesh, settings, artery), _angles(mesh, settings), closed_radii(mesh, artery), indexing="ij"
+        _heights(mesh, settings, artery), angles(mesh, settings), closed_radii(mesh, artery), indexing="ij"
     )
     return jnp.stack([r * jnp.cos(theta), r * jnp.sin(theta), z], axis=-1).reshape(-1, 3)

@@ -13,7 +13,7 @@ import math
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -462,8 +462,10 @@ def _finish(
     problem = record.problem
     tell(Progress("verifying", 0.0, "start and best from scratch"))
     start = first or clamp(problem.scene)
-    best, result = _found_cold(record, start)
-    reference = None if problem.reference is None else clamp(problem.reference)
+    with ThreadPoolExecutor(1) as pool:
+        aside = None if problem.reference is None else pool.submit(clamp, problem.reference)
+        best, result = _found_cold(record, start)
+        reference = None if aside is None else aside.result()
     tell(Progress("verifying", 0.2, "how far the figures may be off"))
     start, result = with_errors(start), with_errors(result)
     verification = None

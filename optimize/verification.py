@@ -69,13 +69,13 @@ class Verification:
 
 
 def verify(problem: DesignProblem, results: dict[str, Result]) -> Verification:
-    """Solve the results "start" and "best" from scratch on the finer model."""
+    """Solve the results "start" and "best" on the finer model, carried over from the study's own."""
     fine: dict[str, float | None] = dict.fromkeys(results)
     final: dict[str, dict[str, Any] | None] = dict.fromkeys(results)
     failure, elements = None, 0
     for name, result in results.items():
         try:
-            found = clamp(finer(result.scene))
+            found = clamp(finer(result.scene), guess=result)
         except EquilibriumError as error:
             failure = f"{name}: {error}"
             continue

@@ -110,7 +110,7 @@ def test_a_twin_is_coarser_in_all_directions():
 
 
 def test_without_a_twin_the_error_is_not_known(clamped, monkeypatch):
-    def refuse(scene):
+    def refuse(scene, guess):
         raise jc.EquilibriumError("clamping", "somewhere", Failure("no"), "nothing")
 
     monkeypatch.setattr("jaxclamp.errors.clamp", refuse)

@@ -31,6 +31,7 @@ LEVEL = {
     "model": 7,
     "fields": 8,
     "objectives": 8,
+    "transfer": 8,
     "plots": 9,
     "results": 10,
     "clamping": 11,

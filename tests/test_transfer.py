@@ -1,0 +1,99 @@
+"""A state carried over to another mesh is a start that leads to that mesh's own solution."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxclamp as jc
+from jaxclamp.clamping import inflate
+from jaxclamp.meshes import closed_positions
+from jaxclamp.model import build_model
+from jaxclamp.transfer import transferred
+
+
+def on_mesh(scene, **counts):
+    return dataclasses.replace(scene, mesh=dataclasses.replace(scene.mesh, **counts))
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    scene = on_mesh(jc.load_scene("human-lad"), circumferential=6, axial=9, radial=(2, 2))
+    return jc.clamp(scene)
+
+
+def test_onto_the_same_mesh_nothing_changes(coarse):
+    state = coarse.states[-1].state
+    again = transferred(state, coarse.model, coarse.model)
+    np.testing.assert_allclose(again.x, state.x, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(again.p, state.p, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        {"circumferential": 12, "axial": 17, "radial": (3, 4)},
+        {"circumferential": 4, "axial": 5, "radial": (1, 1)},
+        {"axial_grading": 0.5, "circumferential_grading": 1.0},
+        {"element": "q2p1"},
+    ],
+    ids=["finer", "coarser", "graded", "quadratic"],
+)
+def test_a_round_tube_stays_round(coarse, mesh):
+    """Akima's splines are of third order: 6 elements to a quarter circle leave 2e-3 of its radius."""
+    old = coarse.model
+    new = build_model(on_mesh(coarse.scene, **mesh))
+    artery = coarse.scene.artery
+    round_tube = dataclasses.replace(
+        coarse.states[0].state, x=closed_positions(old.mesh, old.scene.mesh, artery)
+    )
+    wanted = closed_positions(new.mesh, new.scene.mesh, artery)
+    moved = transferred(round_tube, old, new)
+    np.testing.assert_allclose(moved.x, wanted, atol=2e-3 * float(np.max(np.abs(wanted[:, 0]))))
+    planes = new.mesh.fold_plane, new.mesh.compression_plane, new.mesh.clamp_plane
+    for axis, plane in zip((1, 0, 2), planes, strict=True):
+        np.testing.assert_allclose(moved.x[plane, axis], 0.0, atol=1e-15 + 1e-12 * artery.length)
+
+
+def test_pressures_keep_to_their_layer(coarse):
+    old, new = coarse.model, build_model(on_mesh(coarse.scene, radial=(3, 1), axial=14))
+    state = coarse.states[0].state
+    (_, last), _ = old.mesh.layer_cells
+    p = np.where(np.arange(old.mesh.n_cells) < last, 1.0, 2.0)[None]
+    moved = np.asarray(transferred(dataclasses.replace(state, p=p), old, new).p)[0]
+    (_, last), _ = new.mesh.layer_cells
+    assert set(moved[:last]) == {1.0}
+    assert set(moved[last:]) == {2.0}
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        {"circumferential": 9, "axial": 16, "radial": (3, 2)},
+        {"circumferential": 5, "axial": 7, "radial": (2, 1)},
+        {"axial_grading": 1.5},
+    ],
+    ids=["finer", "coarser", "graded"],
+)
+def test_leads_to_the_solution_that_a_cold_start_finds(coarse, mesh):
+    scene = on_mesh(coarse.scene, **mesh)
+    cold, warm = jc.clamp(scene), jc.clamp(scene, guess=coarse)
+    assert len(warm.states) == 3, "the guess was dropped"
+    assert warm.solver["newton_iterations"] < 0.5 * cold.solver["newton_iterations"]
+    for a, b in zip((*cold.states[:2], cold.states[-1]), warm.states, strict=True):
+        np.testing.assert_allclose(a.state.x, b.state.x, rtol=0.0, atol=1e-7)
+    assert warm.final["force_balance_error"] < 1e-8
+
+
+def test_with_harder_contact_on_the_way(coarse):
+    """Another mesh and other floats at once."""
+    scene = jc.replace(on_mesh(coarse.scene, axial=14), "contact.stiffness", 6000.0)
+    cold, warm = jc.clamp(scene), jc.clamp(scene, guess=coarse)
+    assert len(warm.states) == 3, "the guess was dropped"
+    np.testing.assert_allclose(warm.states[-1].state.x, cold.states[-1].state.x, rtol=0.0, atol=1e-7)
+
+
+def test_without_its_clamp(coarse):
+    scene = on_mesh(coarse.scene, axial=12)
+    cold, warm = inflate(scene), inflate(scene, guess=coarse)
+    np.testing.assert_allclose(warm.states[-1].state.x, cold.states[-1].state.x, rtol=0.0, atol=1e-8)
