@@ -7,6 +7,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from jaxclamp.adjoint import value_and_gradient  # noqa: E402
 from jaxclamp.clamping import Progress, Result, clamp  # noqa: E402
 from jaxclamp.equilibrium import EquilibriumError  # noqa: E402
 from jaxclamp.objectives import (  # noqa: E402
@@ -31,7 +32,7 @@ from jaxclamp.objectives import (  # noqa: E402
 )
 from jaxclamp.scene import Scene, replace  # noqa: E402
 from jaxclamp.scene_file import SceneError, dump_scene, load_scene  # noqa: E402
-from jaxclamp.sensitivity import evaluate, value_and_gradient  # noqa: E402
+from jaxclamp.sensitivity import evaluate  # noqa: E402
 
 __all__ = [
     "EquilibriumError",

@@ -278,24 +278,27 @@ def potential(body: Body, x: Array, jaw_height: Array, pressure: Array) -> Array
 
 def stored_energy(body: Body, x: Array) -> Array:
     """Strain energy of the wall of the modelled part, the pressures at their best, uJ."""
-    x_cells = _gather(x, body.topology.cells)
-    dx_dxi = at_points(body.stencils.wall, x_cells)
-    dilatation = _dilatation(body.stencils, body.geometry, dx_dxi)
-    volumetric = 0.5 * jnp.sum(dilatation * _condensed_pressure(body.geometry, dilatation))
-    zero = jnp.zeros(())
+    dx_dxi = at_points(body.stencils.wall, _gather(x, body.topology.cells))
+    geometry = body.geometry
     wall = total(
-        jnp.sum(
-            wall_density(
-                {key: values[:, first:last] for key, values in dx_dxi.items()},
-                body.geometry.to_local[..., first:last],
-                body.geometry.dV[:, first:last],
-                material,
-                zero,
-            )
+        _isochoric(
+            {key: values[:, first:last] for key, values in dx_dxi.items()},
+            geometry.to_local[..., first:last],
+            geometry.dV[:, first:last],
+            material,
         )
         for material, (first, last) in zip(body.parameters.materials, body.topology.layer_cells, strict=True)
     )
-    return wall + volumetric
+    return wall + _volumetric(body.stencils, geometry, dx_dxi)
+
+
+def _isochoric(dx_dxi: Tensor, to_local: Array, dV: Array, material: Material) -> Array:
+    return jnp.sum(wall_density(dx_dxi, to_local, dV, material, jnp.zeros(())))
+
+
+def _volumetric(stencils: Stencils, geometry: Geometry, dx_dxi: Tensor) -> Array:
+    dilatation = _dilatation(stencils, geometry, dx_dxi)
+    return 0.5 * jnp.sum(dilatation * _condensed_pressure(geometry, dilatation))
 
 
 def lumen_volume(body: Body, x: Array) -> Array:
@@ -312,7 +315,7 @@ def contact_potential(body: Body, x: Array, jaw_height: Array) -> Array:
 
 def intima_potential(body: Body, x: Array, plane: Array | float) -> Array:
     """The contact energy of the inner wall of the modelled part against the plane y = `plane`, uJ."""
-    y = at_points(body.stencils.contact, _gather(x, body.topology.lumen_facets))
+    y = at_points(body.stencils.meeting, _gather(x, body.topology.lumen_facets))
     return jnp.sum(_intima(body, plane)(y))
 
 
@@ -362,6 +365,13 @@ def piece(body: Body, state: State, first: int, last: int) -> Piece:
         p=state.p[:, first:last],
         geometry=jax.tree_util.tree_map(lambda a: a[..., first:last], g),
     )
+
+
+def block_energy(piece: Piece, stencils: Stencils, material: Material) -> Array:
+    """Strain energy of the cells of a block, the pressures at their best, uJ."""
+    g = piece.geometry
+    dx_dxi = at_points(stencils.wall, piece.x)
+    return _isochoric(dx_dxi, g.to_local, g.dV, material) + _volumetric(stencils, g, dx_dxi)
 
 
 @jax.jit
@@ -431,7 +441,7 @@ def assemble(body: Body, state: State, pressure: Array, blocks: list[Block]) -> 
     lumen_e, lumen_f, lumen_k = cell_derivatives(
         _lumen(body, pressure), st.lumen, _gather(x, top.lumen_facets)
     )
-    meet_e, meet_f, meet_k = cell_derivatives(_intima(body), st.contact, _gather(x, top.lumen_facets))
+    meet_e, meet_f, meet_k = cell_derivatives(_intima(body), st.meeting, _gather(x, top.lumen_facets))
     jaw_e, jaw_f, jaw_k = cell_derivatives(
         _jaw(body, state.jaw_height), st.contact, _gather(x, top.outer_facets)
     )

@@ -18,6 +18,7 @@ from jaxclamp.equilibrium import (
     Ease,
     Equilibrium,
     EquilibriumError,
+    Exhausted,
     Held,
     JawForce,
     LumenHeight,
@@ -189,7 +190,9 @@ class _Walk:
             if path is None:
                 return equilibrium
             equilibrium = self.walk("clamping", equilibrium, path, self.tell_closing, reached)
-        raise self.error("clamping", equilibrium, NotConverged("the stop was not reached"))
+        raise self.error(
+            "clamping", equilibrium, NotConverged(f"the wall lost stability {MAX_RESCUES} times")
+        )
 
     def next_path(self, now: Equilibrium) -> tuple[Path | None, Callable[[Equilibrium], bool]]:
         """The load path from here towards the stop, and where to leave it early; None at the stop."""
@@ -301,12 +304,16 @@ class _Walk:
             if self.inflated(start) is None:
                 failure = NotConverged("the wall does not carry the pressure: it balloons")
             raise self.error(stage, equilibrium, failure)
+        # from where the jaw was lowest: a path may come back up and would be walked for ever
+        closed = [equilibrium, *(kept.equilibrium for kept in self.states if kept.stage == "clamping")]
+        lowest = min(closed, key=lambda e: float(e.state.jaw_height))
         move = RESCUE_MOVE * self.outer_radius
         while move > 1e-3 * RESCUE_MOVE * self.outer_radius:
-            height = float(equilibrium.state.jaw_height) - move
-            step = self.held(height)
+            step = self.held(float(lowest.state.jaw_height) - move)
             try:
-                found = self.settle(equilibrium.state, step)
+                found = self.settle(lowest.state, step)
+            except Exhausted:
+                break
             except NotConverged as error:
                 failure, move = error, 0.5 * move
                 continue

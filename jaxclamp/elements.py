@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -16,9 +17,19 @@ def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.polynomial.legendre.leggauss(n)
 
 
-def tensor_rule(counts: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def lobatto(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Lobatto points (n,), the ends among them, and weights (n,) on [-1, 1]; n of at least 2."""
+    P = np.polynomial.legendre.Legendre.basis(n - 1)
+    points = np.concatenate([[-1.0], np.sort(P.deriv().roots().real), [1.0]])
+    return points, 2.0 / (n * (n - 1) * P(points) ** 2)
+
+
+Rule = Callable[[int], tuple[np.ndarray, np.ndarray]]
+
+
+def tensor_rule(counts: tuple[int, ...], rule: Rule = gauss) -> tuple[np.ndarray, np.ndarray]:
     """Product rule: points (n_q, dimensions) and weights (n_q,)."""
-    rules = [gauss(n) for n in counts]
+    rules = [rule(n) for n in counts]
     points = np.array(list(itertools.product(*[r[0] for r in rules])))
     weights = np.array([np.prod(w) for w in itertools.product(*[r[1] for r in rules])])
     return points, weights

@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from jaxclamp.contact import Contact
-from jaxclamp.elements import lagrange, tensor_rule
+from jaxclamp.elements import lagrange, lobatto, tensor_rule
 from jaxclamp.jaws import Jaw
 from jaxclamp.materials import Material
 from jaxclamp.meshes import Mesh, stress_free_positions
@@ -61,7 +61,9 @@ class Stencils:
     lumen: np.ndarray
     """N, dN/deta, dN/dzeta at the points of a facet, (n_fq, 3, n_fn)"""
     contact: np.ndarray
-    """N at the contact points of a facet, (n_cq, 1, n_fn)"""
+    """N at the contact points of an outer facet, (n_cq, 1, n_fn)"""
+    meeting: np.ndarray
+    """N at the contact points of an inner facet, (n_mq, 1, n_fn)"""
 
 
 @record
@@ -75,7 +77,7 @@ class Geometry:
     dA: Array
     """stress-free outer area of a contact point, mm^2, (n_cq, n_facets)"""
     dA_inner: Array
-    """stress-free area of a contact point of the lumen's surface, mm^2, (n_cq, n_facets)"""
+    """stress-free area of a contact point of the lumen's surface, mm^2, (n_mq, n_facets)"""
     pressure_stiffness: Array
     """inverse of M, kPa/mm^3, (n_m, n_m, n_cells)"""
 
@@ -85,14 +87,25 @@ def build_stencils(mesh: Mesh, settings: MeshSettings) -> Stencils:
     element = mesh.element
     points, _ = element.quadrature()
     facet_points, _ = tensor_rule((element.points_per_axis,) * 2)
-    contact_points, _ = tensor_rule((settings.contact_points,) * 2)
+    (jaw_points, _), (meeting_points, _) = _contact_rules(settings)
     N, dN = lagrange(element.nodes_1d, facet_points)
     return Stencils(
         wall=element.shape(points)[1],
         modes=element.pressure_modes(points),
         lumen=np.concatenate([N[:, None], dN], axis=1),
-        contact=lagrange(element.nodes_1d, contact_points)[0][:, None],
+        contact=lagrange(element.nodes_1d, jaw_points)[0][:, None],
+        meeting=lagrange(element.nodes_1d, meeting_points)[0][:, None],
     )
+
+
+def _contact_rules(settings: MeshSettings) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Points and weights of contact with the jaw, and between inner walls.
+
+    Where a wall crumples, single nodes go ahead of all points inside their facets: the inner walls
+    meet at the nodes too.
+    """
+    n = settings.contact_points
+    return tensor_rule((n, n)), tensor_rule((max(n, 2),) * 2, lobatto)
 
 
 @jax.jit
@@ -114,21 +127,21 @@ def build_geometry(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Geomet
     modes = element.pressure_modes(points)
     M = jnp.einsum("mq,nq,qc->cmn", modes, modes, dV) / bulk[:, None, None]
 
-    facet_points, facet_weights = tensor_rule((settings.contact_points,) * 2)
-    _, dN_facet = lagrange(element.nodes_1d, facet_points)
+    jaw_rule, meeting_rule = _contact_rules(settings)
     outer_face, inner_face = (element.node_grid[:, 0] == side for side in (element.order, 0))
     last = mesh.layer_cells[-1][0] + settings.radial[-1] - 1
     first_layer_end = mesh.layer_cells[0][1]
 
-    def area(X_facet: Array) -> Array:
-        tangents = jnp.einsum("qka,iac->kiqc", dN_facet, X_facet)
-        return norm(cross(tangents[0], tangents[1])) * facet_weights[:, None]
+    def area(X_facet: Array, rule: tuple[np.ndarray, np.ndarray]) -> Array:
+        points, weights = rule
+        tangents = jnp.einsum("qka,iac->kiqc", lagrange(element.nodes_1d, points)[1], X_facet)
+        return norm(cross(tangents[0], tangents[1])) * weights[:, None]
 
     return Geometry(
         to_local=stacked(product(inverse(jacobian), axes)),
         dV=dV,
-        dA=area(X[:, outer_face, last :: settings.radial[-1]]),
-        dA_inner=area(X[:, inner_face, : first_layer_end : settings.radial[0]]),
+        dA=area(X[:, outer_face, last :: settings.radial[-1]], jaw_rule),
+        dA_inner=area(X[:, inner_face, : first_layer_end : settings.radial[0]], meeting_rule),
         pressure_stiffness=jnp.moveaxis(jnp.linalg.inv(M), 0, -1),
     )
 

@@ -69,6 +69,10 @@ class NotConverged(Exception):
         self.residual, self.J_min = residual, J_min
 
 
+class Exhausted(NotConverged):
+    """Patience is out: nothing further is to be tried."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Held:
     """The jaw stays at a height, mm."""
@@ -179,7 +183,7 @@ class System:
     def linearise(self, state: State, pressure: float) -> Linearisation:
         """Forces and tangent, on the host (numpy arrays). Raises NotConverged when patience is out."""
         if self.linearisations >= MAX_LINEARISATIONS:
-            raise NotConverged(f"given up after {MAX_LINEARISATIONS} assemblies")
+            raise Exhausted(f"the path has too many turns for {MAX_LINEARISATIONS} assemblies")
         start = time.perf_counter()
         lin: Linearisation = jax.device_get(linearise(self.body, state, jnp.asarray(pressure)))
         seconds = time.perf_counter() - start
@@ -271,7 +275,9 @@ def newton(
         first_imbalance = imbalance if iteration == 0 else first_imbalance
         if iteration > 2 and imbalance > DIVERGING * first_imbalance:
             raise NotConverged("Newton's residual grows", residual_norm(lin), float(lin.J_min))
-    raise NotConverged(f"{MAX_NEWTON} Newton iterations", residual_norm(lin), float(lin.J_min))
+    raise NotConverged(
+        f"Newton's method goes on beyond {MAX_NEWTON} iterations", residual_norm(lin), float(lin.J_min)
+    )
 
 
 def predict(system: System, near: Equilibrium, step: Step) -> State:
@@ -329,7 +335,9 @@ def _admissible(
         if _sound(trial_lin) and float(trial_lin.imbalance) <= bound:
             return trial, trial_lin, cut
         fraction *= 0.4
-    raise NotConverged("no admissible step", residual_norm(lin), float(lin.J_min))
+    raise NotConverged(
+        "a Newton step inverts cells or makes forces explode", residual_norm(lin), float(lin.J_min)
+    )
 
 
 def descend(system: System, state: State, step: Step) -> Equilibrium:

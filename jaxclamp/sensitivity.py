@@ -33,7 +33,7 @@ from jaxclamp.assembly import Body, State, artery_forces, contact_forces, with_e
 from jaxclamp.clamping import clamp, inflate
 from jaxclamp.equilibrium import Equilibrium
 from jaxclamp.linear_solvers import LinearSolver
-from jaxclamp.measures import PARTS_OF_A_JAW
+from jaxclamp.measures import PARTS_OF_A_JAW, Landmarks
 from jaxclamp.model import Discretisation, body_of, discretise
 from jaxclamp.objectives import Measure, Seen
 from jaxclamp.pytree import record
@@ -84,19 +84,25 @@ def stop_equations(scene: Scene, parts: Discretisation, u: Unknowns) -> Unknowns
     return dataclasses.replace(jaw, stop=closed + jaw.stop)
 
 
+def closing_residual(
+    stop: Stop, marks: Landmarks, x0: Array, x1: Array, jaw_height: Array, lift: Array
+) -> Array:
+    """Residual of the stop, mm (mN for a force stop); x0: in the body, lift: d Pi/d jaw_height, mN."""
+    top, outer = marks.lumen_top, marks.outer_top
+    if isinstance(stop, OcclusionStop):
+        return x1[top, 1] - (1.0 - stop.occlusion) * x0[top, 1]
+    if isinstance(stop, TravelStop):
+        return jaw_height - (x0[outer, 1] - stop.travel)
+    return -lift - stop.force / PARTS_OF_A_JAW
+
+
 @jax.jit
 def _jaw_equations(
     body: Body, stop: Stop, parts: Discretisation, x0: Array, x1: Array, jaw_height: Array
 ) -> tuple[Array, Array]:
     """Contact forces on the free positions, mN, (n_free,), and the residual of the stop."""
     touch, lift = contact_forces(body, x1, jaw_height)
-    top, outer = parts.marks.lumen_top, parts.marks.outer_top
-    if isinstance(stop, OcclusionStop):
-        closing = x1[top, 1] - (1.0 - stop.occlusion) * x0[top, 1]
-    elif isinstance(stop, TravelStop):
-        closing = jaw_height - (x0[outer, 1] - stop.travel)
-    else:
-        closing = -lift - stop.force / PARTS_OF_A_JAW
+    closing = closing_residual(stop, parts.marks, x0, x1, jaw_height, lift)
     return touch.ravel()[parts.topology.free], closing
 
 
@@ -238,10 +244,15 @@ def register(known: Solution) -> np.ndarray:
 
 
 def _solve(ticket: Any, b: Unknowns, *, transposed: bool) -> Unknowns:
-    """Solve A z = b or A' z = b for right-hand sides with any batch axes in front."""
+    """The linear system of a registered solution."""
     known = _solutions.get(int(np.asarray(ticket).ravel()[0]))
     if known is None:
         raise RuntimeError("this equilibrium is no longer kept: differentiate fewer scenes at a time")
+    return solve_linear(known, b, transposed=transposed)
+
+
+def solve_linear(known: Solution, b: Unknowns, *, transposed: bool) -> Unknowns:
+    """Solve A z = b or A' z = b, A = dR/du, for right-hand sides with any batch axes in front."""
     n = len(known.coupling)
     columns = lambda a: np.asarray(a).reshape(-1, n).T  # noqa: E731  (n, n_rhs)
     solve_0 = lambda b: _solve_columns(known.solvers.holding(known.tangents[0]), b)  # noqa: E731
@@ -341,18 +352,6 @@ def evaluate(scene: Scene, measure: Measure, *, guess: Result | None = None) -> 
 def solve(scene: Scene, to_stop: bool, guess: Result | None = None) -> Result:
     """The equilibria of a scene, as far as they are needed."""
     return (clamp if to_stop else inflate)(scene, guess=guess)
-
-
-def value_and_gradient(result: Result, measure: Measure) -> tuple[float, Scene]:
-    """Value of a measure and its derivative by every float of the scene, at a result at hand.
-
-    The gradient is a scene, per internal unit (mm, kPa, mN, radians).
-    """
-    known = solution(result, measure.needs_stop)
-    scene = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), result.scene)
-    at_hand = lambda s: measured(measure, s, result.model.discretisation, known.u, register(known))  # noqa: E731
-    value, gradient = jax.value_and_grad(at_hand)(scene)
-    return float(value), gradient
 
 
 def _solve_in_worker(scene: Scene, parts: Discretisation, to_stop: bool) -> tuple[Unknowns, Any]:

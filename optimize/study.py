@@ -471,7 +471,8 @@ def _finish(
     verification = None
     if check_finer_mesh:
         tell(Progress("verifying", 0.3, "on a finer mesh, with stiffer and sharper contact"))
-        verification = verify(problem, {"start": start, "best": result})
+        compared = {} if reference is None else {"reference": reference}
+        verification = verify(problem, {**compared, "start": start, "best": result})
     tell(Progress("verifying", 1.0, "" if verification is None else verification.sentence))
     return Study(
         problem=problem,

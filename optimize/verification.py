@@ -22,7 +22,7 @@ def finer(scene: Scene) -> Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Verification:
-    """Start and best on the finer model; None where it has no equilibrium."""
+    """Start, best and perhaps a reference on the finer model; None where it has no equilibrium."""
 
     coarse: dict[str, float]
     """objective on the study's own model, internal units"""
@@ -69,7 +69,7 @@ class Verification:
 
 
 def verify(problem: DesignProblem, results: dict[str, Result]) -> Verification:
-    """Solve the results "start" and "best" on the finer model, carried over from the study's own."""
+    """Solve the results "start" and "best" (and others) on the finer model, carried over from their own."""
     fine: dict[str, float | None] = dict.fromkeys(results)
     final: dict[str, dict[str, Any] | None] = dict.fromkeys(results)
     failure, elements = None, 0

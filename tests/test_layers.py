@@ -39,6 +39,7 @@ LEVEL = {
     "paraview": 12,
     "sensitivity": 12,
     "accuracy": 13,
+    "adjoint": 13,
     "report": 13,
     "export": 14,
     "price_report": 15,
