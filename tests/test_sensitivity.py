@@ -163,7 +163,7 @@ def check_differences(stop: str, family: str, measures: tuple[jc.Measure, ...]) 
     exact = np.array([dot(gradient_of(stop, m)[1], direction) for m in measures])
     values = np.array([gradient_of(stop, m)[0] for m in measures])
     errors = []
-    for h in (1e-2, 1e-3, 1e-4, 1e-5):
+    for h in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
         both = [solver(stop)(moved(result.scene, direction, s * h), guess=result) for s in (1.0, -1.0)]
         ahead, behind = ([r.measure(m) for m in measures] for r in both)
         difference = (np.array(ahead) - np.array(behind)) / (2.0 * h)
