@@ -28,8 +28,8 @@ from jaxclamp.assembly import (
     block_energy,
     contact_potential,
     cut,
-    intima_potential,
     lumen_volume,
+    touch_potential,
     with_equilibrium_pressure,
 )
 from jaxclamp.energies import Geometry, Parameters, Stencils
@@ -164,9 +164,7 @@ def _surface_work(
         blood = lambda x: -sizes.pressure * lumen_volume(same, x)  # noqa: E731
         done: Array = jax.jvp(blood, (sizes.x_body,), (y_body,))[1]
         if y_stop is not None:
-            closed = lambda x: (  # noqa: E731
-                blood(x) + contact_potential(same, x, height) + intima_potential(same, x, 0.0)
-            )
+            closed = lambda x: blood(x) + touch_potential(same, x, height)  # noqa: E731
             lift = jax.grad(contact_potential, argnums=2)(same, sizes.x_stop, height)
             closing = closing_residual(sizes.stop, marks, sizes.x_body, sizes.x_stop, height, lift)
             done = done + jax.jvp(closed, (sizes.x_stop,), (y_stop,))[1] + y_height * closing
@@ -201,6 +199,6 @@ def _by_scene(
 
     of_sizes = jax.tree_util.tree_map(jnp.subtract, measured, surfaces)
     of_blocks = [
-        jax.tree_util.tree_map(lambda *parts: -sum(parts), *block) for block in zip(*walls, strict=True)
+        jax.tree_util.tree_map(lambda *each: -sum(each), *block) for block in zip(*walls, strict=True)
     ]
     return jax.vjp(sizes, scene)[1]((of_sizes, of_blocks))[0]

@@ -272,8 +272,17 @@ def _condensed_pressure(geometry: Geometry, dilatation: Array) -> Array:
 
 def potential(body: Body, x: Array, jaw_height: Array, pressure: Array) -> Array:
     """Pi with the pressures at their best, uJ: a function of positions and loads alone."""
-    touch = contact_potential(body, x, jaw_height) + intima_potential(body, x, 0.0)
-    return stored_energy(body, x) - pressure * lumen_volume(body, x) + touch
+    return artery_potential(body, x, pressure) + touch_potential(body, x, jaw_height)
+
+
+def artery_potential(body: Body, x: Array, pressure: Array) -> Array:
+    """The part of wall and blood, uJ."""
+    return stored_energy(body, x) - pressure * lumen_volume(body, x)
+
+
+def touch_potential(body: Body, x: Array, jaw_height: Array) -> Array:
+    """The part of all contact, uJ."""
+    return contact_potential(body, x, jaw_height) + intima_potential(body, x, 0.0)
 
 
 def stored_energy(body: Body, x: Array) -> Array:
@@ -420,16 +429,14 @@ def linearise_block(piece: Piece, stencils: Stencils, material: Material) -> Blo
 def artery_forces(body: Body, x: Array, pressure: Array) -> Array:
     """d Pi/dx of wall and blood without contact, mN, (n_nodes, 3): what `linearise` gives without the
     tangent, in one program that is cheap to differentiate."""
-    artery = lambda y: stored_energy(body, y) - pressure * lumen_volume(body, y)  # noqa: E731
-    forces: Array = jax.grad(artery)(x)
+    forces: Array = jax.grad(artery_potential, argnums=1)(body, x, pressure)
     return forces
 
 
 @jax.jit
 def contact_forces(body: Body, x: Array, jaw_height: Array) -> tuple[Array, Array]:
     """d Pi/dx of all contact, mN, (n_nodes, 3), and d Pi/d jaw_height, mN."""
-    touch = lambda y, d: contact_potential(body, y, d) + intima_potential(body, y, 0.0)  # noqa: E731
-    slopes: tuple[Array, Array] = jax.grad(touch, argnums=(0, 1))(x, jaw_height)
+    slopes: tuple[Array, Array] = jax.grad(touch_potential, argnums=(1, 2))(body, x, jaw_height)
     return slopes
 
 

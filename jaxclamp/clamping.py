@@ -191,7 +191,7 @@ class _Walk:
                 return equilibrium
             equilibrium = self.walk("clamping", equilibrium, path, self.tell_closing, reached)
         raise self.error(
-            "clamping", equilibrium, NotConverged(f"the wall lost stability {MAX_RESCUES} times")
+            "clamping", equilibrium, NotConverged(f"{MAX_RESCUES} descents did not lead to the stop")
         )
 
     def next_path(self, now: Equilibrium) -> tuple[Path | None, Callable[[Equilibrium], bool]]:
@@ -307,18 +307,21 @@ class _Walk:
         # from where the jaw was lowest: a path may come back up and would be walked for ever
         closed = [equilibrium, *(kept.equilibrium for kept in self.states if kept.stage == "clamping")]
         lowest = min(closed, key=lambda e: float(e.state.jaw_height))
+        past = isinstance(self.model.scene.stop, OcclusionStop) and self._share_of_stop(lowest) > 1.0 + 1e-6
         move = RESCUE_MOVE * self.outer_radius
         while move > 1e-3 * RESCUE_MOVE * self.outer_radius:
             step = self.held(float(lowest.state.jaw_height) - move)
             try:
                 found = self.settle(lowest.state, step)
-            except Exhausted:
+            except Exhausted:  # what failed before is the cause
                 break
             except NotConverged as error:
                 failure, move = error, 0.5 * move
                 continue
             tell(s, found)
             return found
+        if past:
+            failure = NotConverged("the lumen snaps shut past the stop, and no way back to it was found")
         raise self.error(stage, equilibrium, failure)
 
     def solve_or_descend(self, stage: str, start: State, step: Step, load: str) -> Equilibrium:
@@ -418,13 +421,14 @@ def _clamp(
     require_computable(scene)
     model = build_model(scene, None if guess is None else guess.model)
     warm = None if guess is None else _on_mesh_of(model, guess)
-    carried_over = warm is not guess
+    carried_over = warm is not None and warm is not guess
     keep_solver = warm is not None and not carried_over and warm.scene.solver == scene.solver
     walk = _Walk(model, _reporter(progress), start, warm.linear_solvers if warm and keep_solver else None)
     try:
         if warm is not None and _warm(walk, warm, to_stop, carried_over):
             return _result(walk, None)
         walk.states.clear()
+        walk.system.be_patient()  # a guess that leads nowhere costs time, nothing else
         physiological = walk.physiological(walk.load_free(None), None)
         if to_stop:
             walk.close(physiological)
@@ -539,7 +543,8 @@ def _warm_stop(walk: _Walk, guess: Result, last: Equilibrium, carried_over: bool
                 break
     walk.use(target)
     walk.refer_to(base)
-    return last if reached == 1.0 else None
+    less_stable = (last.negative_pivots or 0) > (guess.states[-1].equilibrium.negative_pivots or 0)
+    return last if reached == 1.0 and not less_stable else None
 
 
 def predicted(result: Result, scene: Scene) -> Result:
@@ -569,8 +574,9 @@ def predicted(result: Result, scene: Scene) -> Result:
 
 
 def between(a: Scene, b: Scene, t: float) -> Scene:
-    """The scene whose floats lie at the share t of the way from a to b."""
-    return jax.tree_util.tree_map(lambda u, v: u + t * (v - u), a, b)
+    """The scene b with floats at the share t of the way from a to b."""
+    alike = dataclasses.replace(a, title=b.title, solver=b.solver)
+    return jax.tree_util.tree_map(lambda u, v: u + t * (v - u), alike, b)
 
 
 def _closing_at_stop(walk: _Walk, near: Equilibrium) -> Held | LumenHeight | JawForce:

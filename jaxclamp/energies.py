@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from jaxclamp.contact import Contact
-from jaxclamp.elements import lagrange, lobatto, tensor_rule
+from jaxclamp.elements import Element, lagrange, lobatto, tensor_rule
 from jaxclamp.jaws import Jaw
 from jaxclamp.materials import Material
 from jaxclamp.meshes import Mesh, stress_free_positions
@@ -87,7 +87,7 @@ def build_stencils(mesh: Mesh, settings: MeshSettings) -> Stencils:
     element = mesh.element
     points, _ = element.quadrature()
     facet_points, _ = tensor_rule((element.points_per_axis,) * 2)
-    (jaw_points, _), (meeting_points, _) = _contact_rules(settings)
+    (jaw_points, _), (meeting_points, _) = _contact_rules(element, settings)
     N, dN = lagrange(element.nodes_1d, facet_points)
     return Stencils(
         wall=element.shape(points)[1],
@@ -98,14 +98,16 @@ def build_stencils(mesh: Mesh, settings: MeshSettings) -> Stencils:
     )
 
 
-def _contact_rules(settings: MeshSettings) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+def _contact_rules(element: Element, settings: MeshSettings) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Points and weights of contact with the jaw, and between inner walls.
 
     Where a wall crumples, single nodes go ahead of all points inside their facets: the inner walls
-    meet at the nodes too.
+    meet at the nodes too (with quadratic elements an odd number of points has the middle ones).
     """
     n = settings.contact_points
-    return tensor_rule((n, n)), tensor_rule((max(n, 2),) * 2, lobatto)
+    m = max(n, element.order + 1)
+    m += element.order == 2 and m % 2 == 0
+    return tensor_rule((n, n)), tensor_rule((m, m), lobatto)
 
 
 @jax.jit
@@ -127,7 +129,7 @@ def build_geometry(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Geomet
     modes = element.pressure_modes(points)
     M = jnp.einsum("mq,nq,qc->cmn", modes, modes, dV) / bulk[:, None, None]
 
-    jaw_rule, meeting_rule = _contact_rules(settings)
+    jaw_rule, meeting_rule = _contact_rules(element, settings)
     outer_face, inner_face = (element.node_grid[:, 0] == side for side in (element.order, 0))
     last = mesh.layer_cells[-1][0] + settings.radial[-1] - 1
     first_layer_end = mesh.layer_cells[0][1]

@@ -179,11 +179,16 @@ class System:
     assembly_seconds: float = 0.0
     first_seconds: float = 0.0
     linearisations: int = 0
+    patience: int = MAX_LINEARISATIONS
+
+    def be_patient(self) -> None:
+        """Allow as many assemblies from here as a clamping may need."""
+        self.patience = self.linearisations + MAX_LINEARISATIONS
 
     def linearise(self, state: State, pressure: float) -> Linearisation:
         """Forces and tangent, on the host (numpy arrays). Raises NotConverged when patience is out."""
-        if self.linearisations >= MAX_LINEARISATIONS:
-            raise Exhausted(f"the path has too many turns for {MAX_LINEARISATIONS} assemblies")
+        if self.linearisations >= self.patience:
+            raise Exhausted(f"no way was found in {MAX_LINEARISATIONS} assemblies")
         start = time.perf_counter()
         lin: Linearisation = jax.device_get(linearise(self.body, state, jnp.asarray(pressure)))
         seconds = time.perf_counter() - start
@@ -413,7 +418,9 @@ def descend_eased(system: System, state: State, step: Step, ease: Ease) -> Equil
             except NotConverged:
                 stride *= 0.5
                 if stride < SMALLEST_STIFFENING:
-                    raise
+                    system.body = whole
+                    found, share = descend(system, found.state, step), 0.0
+                    snapped = snapped or found.snapped
     finally:
         system.body = whole
     if found.negative_pivots:

@@ -14,6 +14,7 @@ from jaxclamp.errors import SOURCES
 from jaxclamp.export import STAGING, into_place
 from jaxclamp.plots.accuracy import Panel, plot_prices
 from jaxclamp.plots.style import png
+from jaxclamp.results import versions
 
 LABELS = {
     "physiological.lumen_radius_mm": "lumen radius",
@@ -85,11 +86,12 @@ def markdown(prices: PriceList) -> str:
         parts = [found[source] for source in SOURCES]
         cells = ["-" if part is None else f"{part:+.2g}" for part in parts]
         sources.append(bar([f"{name} ({unit})" if unit else name, f"{prices.exact[key]:.5g}", *cells]))
+    code = ", ".join(f"{name} {number}" for name, number in versions().items() if name in ("jaxclamp", "jax"))
     return "\n".join(
         [
             f"# What accuracy costs: {prices.title}",
             "",
-            f"Machine: {machine()}. Seconds are of one clamping with everything compiled.",
+            f"Machine: {machine()}; {code}. Seconds are of one clamping with everything compiled.",
             "",
             *table,
             "",

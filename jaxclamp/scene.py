@@ -98,7 +98,7 @@ class MeshSettings:
     element: str = static("q1p0", choices=("q1p0", "q2p1"))
     """q1p0: 8 nodes, mean dilatation; q2p1: 27 nodes, linear discontinuous pressure"""
     contact_points: int = static(4)
-    """contact quadrature points per facet and direction"""
+    """contact quadrature points per facet and direction (more between inner walls where nodes need it)"""
 
 
 @record

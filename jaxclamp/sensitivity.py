@@ -3,7 +3,7 @@
 The unknowns u are the free positions of the physiological state, those at the stop, and the jaw's
 height; pressures are eliminated. They solve, for a scene s,
 
-    R_0(u_0, s) = d Pi/dx without the jaw = 0                  in the body
+    R_0(u_0, s) = d Pi/dx without contact = 0                  in the body
     R_1(u_1, h, s) = d Pi/dx = 0,  S(u_0, u_1, h, s) = 0       at the stop (bordered)
 
 so that du = -(dR/du)^-1 dR/ds ds. `implicit` is the identity on u with exactly this derivative,

@@ -56,7 +56,9 @@ def _middles(model: Model, layer: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def _smooth(values: np.ndarray, known: np.ndarray, wanted: np.ndarray, axis: int) -> np.ndarray:
-    return np.asarray(Akima1DInterpolator(known, values, axis=axis)(wanted))
+    # the last lines of two gradings may differ by rounding, and Akima's splines end with the known ones
+    inside = np.clip(wanted, known[0], known[-1])
+    return np.asarray(Akima1DInterpolator(known, values, axis=axis)(inside))
 
 
 def _linear(values: np.ndarray, known: np.ndarray, wanted: np.ndarray, axis: int) -> np.ndarray:

@@ -465,7 +465,11 @@ def _finish(
     with ThreadPoolExecutor(1) as pool:
         aside = None if problem.reference is None else pool.submit(clamp, problem.reference)
         best, result = _found_cold(record, start)
-        reference = None if aside is None else aside.result()
+        try:
+            reference = None if aside is None else aside.result()
+        except EquilibriumError as error:  # the study stands without it
+            reference = None
+            tell(Progress("verifying", 0.2, f"no reference: {error}"))
     tell(Progress("verifying", 0.2, "how far the figures may be off"))
     start, result = with_errors(start), with_errors(result)
     verification = None

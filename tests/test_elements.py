@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxclamp.elements import ELEMENTS, gauss, lagrange, tensor_rule
+from jaxclamp.elements import ELEMENTS, gauss, lagrange, lobatto, tensor_rule
 
 every_element = pytest.mark.parametrize("element", ELEMENTS.values(), ids=ELEMENTS)
 inside = np.random.default_rng(1).uniform(-1.0, 1.0, (40, 3))
@@ -178,6 +178,17 @@ def test_gauss_rule():
     points, weights = gauss(2)
     np.testing.assert_allclose(points, [-1 / np.sqrt(3), 1 / np.sqrt(3)], rtol=1e-14)
     np.testing.assert_allclose(weights, 1.0, rtol=1e-14)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 8])
+def test_lobatto_rule(n):
+    """The ends are points; polynomials of degree 2 n - 3 are integrated exactly, the next even one is not."""
+    points, weights = lobatto(n)
+    assert (points[0], points[-1], len(points)) == (-1.0, 1.0, n)
+    for degree in range(2 * n - 2):
+        expected = (1.0 + (-1.0) ** degree) / (degree + 1)
+        assert weights @ points**degree == pytest.approx(expected, abs=1e-14)
+    assert abs(weights @ points ** (2 * n - 2) - 2.0 / (2 * n - 1)) > 1e-6
 
 
 def test_tensor_rule_may_differ_by_axis():
