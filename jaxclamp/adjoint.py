@@ -157,7 +157,10 @@ def _block_work(piece: Piece, material: Material, stencils: Stencils, y: Array) 
 def _surface_work(
     body: Body, marks: Landmarks, at: Sizes, y_body: Array, y_stop: Array | None, y_height: Array
 ) -> Sizes:
-    """Derivatives of the forces of blood and contact times y, and of the stop's times its adjoint."""
+    """Derivatives of the forces of blood and contact times y plus the residual of the stop times y_height.
+
+    y_body, y_stop: (n_nodes, 3); y_stop is None for a measure of the body alone
+    """
 
     def work(sizes: Sizes) -> Array:
         same, height = _with(body, sizes), sizes.jaw_height
