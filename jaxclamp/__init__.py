@@ -7,10 +7,9 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxclamp.adjoint import value_and_gradient  # noqa: E402
-from jaxclamp.clamping import Progress, Result, clamp  # noqa: E402
-from jaxclamp.equilibrium import EquilibriumError  # noqa: E402
-from jaxclamp.objectives import (  # noqa: E402
+from jaxclamp.core.failures import EquilibriumError, SceneError  # noqa: E402
+from jaxclamp.core.progress import Progress  # noqa: E402
+from jaxclamp.observe.measures import (  # noqa: E402
     Measure,
     axial_stress_at_P,
     circumferential_stress_at_P,
@@ -30,9 +29,11 @@ from jaxclamp.objectives import (  # noqa: E402
     stored_energy,
     volume_above,
 )
-from jaxclamp.scene import Scene, replace  # noqa: E402
-from jaxclamp.scene_file import SceneError, dump_scene, load_scene  # noqa: E402
-from jaxclamp.sensitivity import evaluate  # noqa: E402
+from jaxclamp.scenes.files import dump_scene, load_scene  # noqa: E402
+from jaxclamp.scenes.scene import Scene, replace  # noqa: E402
+from jaxclamp.sensitivity.adjoint import value_and_gradient  # noqa: E402
+from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
+from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
 
 __all__ = [
     "EquilibriumError",

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jaxclamp import console
-from jaxclamp.presets import KINDS, SceneError, preset
-from jaxclamp.presets import presets as shipped
+from jaxclamp.core.failures import SceneError
+from jaxclamp.scenes.presets import KINDS, preset
+from jaxclamp.scenes.presets import presets as shipped
+from jaxclamp.show import console
 
 if TYPE_CHECKING:
-    from jaxclamp.scene import Scene
+    from jaxclamp.scenes.scene import Scene
 
 DONE, WRONG_INPUT, NOT_CONVERGED, MACHINE_REFUSED, INTERRUPTED = 0, 2, 3, 4, 130
 
@@ -141,7 +142,7 @@ def show(
 ) -> None:
     """Check a scene and say what would be modelled; solves nothing."""
     loaded = _load(scene, fidelity, overrides, quiet)
-    from jaxclamp.model import describe
+    from jaxclamp.potential.model import describe
 
     described = describe(loaded)
     if as_json:
@@ -224,8 +225,8 @@ def accuracy(
     loaded = _load(scene, fidelity, overrides, quiet)
     folder = out or Path(f"{Path(scene).stem}-accuracy")
     _check_folder(folder)
-    from jaxclamp.accuracy import price_list
-    from jaxclamp.price_report import lines, write_prices
+    from jaxclamp.trust.price_list import price_list
+    from jaxclamp.trust.price_report import lines, write_prices
 
     with console.progress(quiet) as progress:
         prices = price_list(loaded, progress if callable(progress) else None)
@@ -259,7 +260,7 @@ def presets(
 
 
 def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:
-    from jaxclamp.scene_file import EXPECTED_ERRORS, load_scene, own_mesh_keys
+    from jaxclamp.scenes.files import EXPECTED_ERRORS, load_scene, own_mesh_keys
 
     loaded = load_scene(scene, overrides or (), fidelity or "standard")
     if fidelity is None or quiet:
@@ -294,9 +295,9 @@ def _check_folder(folder: Path) -> None:
 
 def _solve(scene: Scene, quiet: bool) -> tuple[Any, Exception | None]:
     """The result (None if there is nothing to keep), and why it does not reach the stop."""
-    from jaxclamp.clamping import clamp
-    from jaxclamp.equilibrium import EquilibriumError
-    from jaxclamp.errors import with_errors
+    from jaxclamp.core.failures import EquilibriumError
+    from jaxclamp.solve.clamping import clamp
+    from jaxclamp.trust.estimates import with_errors
 
     try:
         with console.progress(quiet) as progress:
@@ -307,7 +308,7 @@ def _solve(scene: Scene, quiet: bool) -> tuple[Any, Exception | None]:
 
 
 def _write(result: Any, folder: Path, quiet: bool) -> list[Path]:
-    from jaxclamp.export import write_outputs
+    from jaxclamp.show.export import write_outputs
 
     with console.progress(quiet) as progress:
         return list(write_outputs(result, folder, progress if callable(progress) else None))

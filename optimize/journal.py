@@ -13,7 +13,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from jaxclamp import SceneError
-from jaxclamp.console import as_json
+from jaxclamp.show.console import as_json
 
 STUDY, ITERATIONS, LOCK = "study.json", "iterations.csv", ".study.lock"
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import jaxclamp as jc
 from jaxclamp import Measure, SceneError
-from jaxclamp.presets import did_you_mean
+from jaxclamp.scenes.presets import did_you_mean
 
 FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
 """internal unit -> unit in files, and internal units in one of it; the others are the same"""

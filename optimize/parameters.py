@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array
 
 from jaxclamp import Scene, SceneError, replace
-from jaxclamp.presets import did_you_mean
-from jaxclamp.pytree import UNIT_FACTOR, Range
-from jaxclamp.schema import file_key
+from jaxclamp.core.records import UNIT_FACTOR, Range
+from jaxclamp.scenes.presets import did_you_mean
+from jaxclamp.scenes.schema import file_key
 
 
 @dataclasses.dataclass(frozen=True)

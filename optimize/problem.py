@@ -13,10 +13,10 @@ import numpy as np
 from jax import Array
 
 from jaxclamp import EquilibriumError, Result, Scene, SceneError, clamp
-from jaxclamp.model import Discretisation
-from jaxclamp.objectives import Measure
-from jaxclamp.scene_file import require_possible
-from jaxclamp.sensitivity import Unknowns, implicit, register, see, solution
+from jaxclamp.observe.measures import Measure
+from jaxclamp.potential.model import Discretisation
+from jaxclamp.scenes.files import require_possible
+from jaxclamp.sensitivity.implicit import Unknowns, implicit, register, see, solution
 from optimize.parameters import Entry, Variable, entries, resolve, with_design
 
 

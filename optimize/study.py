@@ -22,9 +22,9 @@ import numpy as np
 import scipy.stats
 
 from jaxclamp import EquilibriumError, Progress, Result, SceneError, clamp, dump_scene
-from jaxclamp.errors import with_errors
-from jaxclamp.linear_solvers import cores
-from jaxclamp.results import versions
+from jaxclamp.solve.linear_solvers import cores
+from jaxclamp.solve.results import versions
+from jaxclamp.trust.estimates import with_errors
 from optimize.drivers import METHODS, Enough, Target
 from optimize.journal import Journal
 from optimize.problem import DesignProblem, Evaluation, evaluate, is_possible

@@ -9,10 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxclamp import Progress, Scene, SceneError, load_scene, schema
-from jaxclamp.presets import did_you_mean
-from jaxclamp.pytree import UNIT_FACTOR
-from jaxclamp.scene_file import read_text
+from jaxclamp import Progress, Scene, SceneError, load_scene
+from jaxclamp.core.records import UNIT_FACTOR
+from jaxclamp.scenes import schema
+from jaxclamp.scenes.files import read_text
+from jaxclamp.scenes.presets import did_you_mean
 from optimize.drivers import METHODS
 from optimize.objectives import read_measure
 from optimize.parameters import Variable, resolve

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 import jaxclamp as jc
-from jaxclamp.meshes import build_mesh
-from jaxclamp.model import warnings
+from jaxclamp.fem.tube import build_mesh
+from jaxclamp.potential.model import warnings
 from tube import Incompressible, Sector, extra_stress
 
 Point = Mapping[str, float]

@@ -11,7 +11,11 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
-from jaxclamp.assembly import (
+from jaxclamp.fem.tube import closed_positions
+from jaxclamp.physics.jaws import Cylinder
+from jaxclamp.physics.materials import GOH, HGO, NeoHookean
+from jaxclamp.potential.model import build_model
+from jaxclamp.potential.tangent import (
     State,
     advance,
     linearise,
@@ -20,12 +24,8 @@ from jaxclamp.assembly import (
     supported,
     with_equilibrium_pressure,
 )
-from jaxclamp.jaws import Cylinder
-from jaxclamp.linear_solvers import LinearSolver, full_matrix
-from jaxclamp.materials import GOH, HGO, NeoHookean
-from jaxclamp.meshes import closed_positions
-from jaxclamp.model import build_model
-from jaxclamp.scene import Layer
+from jaxclamp.scenes.scene import Layer
+from jaxclamp.solve.linear_solvers import LinearSolver, full_matrix
 from walks import mesh
 
 PRESSURE = 13.33

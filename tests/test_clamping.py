@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
-from jaxclamp.jaws import Flat, Spline
-from jaxclamp.linear_solvers import available
-from jaxclamp.materials import GOH, NeoHookean
-from jaxclamp.scene import ForceStop, OcclusionStop, TravelStop
+from jaxclamp.physics.jaws import Flat, Spline
+from jaxclamp.physics.materials import GOH, NeoHookean
+from jaxclamp.scenes.scene import ForceStop, OcclusionStop, TravelStop
+from jaxclamp.solve.linear_solvers import available
 from tube import MEDIA, SEED_STRETCH, Compressible
 from walks import mesh
 

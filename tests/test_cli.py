@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from jaxclamp.cli import main
-from jaxclamp.equilibrium import EquilibriumError, NotConverged
-from jaxclamp.presets import presets
-from jaxclamp.scene_file import mesh_for
+from jaxclamp.core.failures import EquilibriumError, NotConverged
+from jaxclamp.scenes.files import mesh_for
+from jaxclamp.scenes.presets import presets
 
 FIGURES = {
     "title": "Human LAD",

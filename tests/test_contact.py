@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxclamp.contact import Contact
+from jaxclamp.physics.contact import Contact
 
 stiffnesses = st.floats(1e-1, 1e6)
 smoothings = st.floats(1e-4, 1.0)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxclamp.elements import ELEMENTS, gauss, lagrange, lobatto, tensor_rule
+from jaxclamp.fem.elements import ELEMENTS, gauss, lagrange, lobatto, tensor_rule
 
 every_element = pytest.mark.parametrize("element", ELEMENTS.values(), ids=ELEMENTS)
 inside = np.random.default_rng(1).uniform(-1.0, 1.0, (40, 3))

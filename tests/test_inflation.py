@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
-from jaxclamp.inflation import inflated_positions, inflated_radius
+from jaxclamp.solve.inflation import inflated_positions, inflated_radius
 from tube import RING, SEED, SEED_EQ10, Incompressible, Sector
 from walks import inflate, mesh, tube_scene
 

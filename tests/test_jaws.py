@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from jaxclamp.jaws import Cylinder, Flat, Jaw, Spline
-from jaxclamp.pytree import concrete_subclasses
+from jaxclamp.core.records import concrete_subclasses
+from jaxclamp.physics.jaws import Cylinder, Flat, Jaw, Spline
 
 SPAN = {"mm": (0.4, 4.0), "": (-0.6, 0.9), "deg": (0.2, 1.0)}
 """values to draw from for a quantity of each unit, inside its own range"""

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from jaxclamp import linear_solvers
-from jaxclamp.assembly import Pattern
-from jaxclamp.linear_solvers import BACK_ENDS, LinearSolver, Singular, available, full_matrix
+from jaxclamp.core.failures import Singular
+from jaxclamp.potential.tangent import Pattern
+from jaxclamp.solve import linear_solvers
+from jaxclamp.solve.linear_solvers import BACK_ENDS, LinearSolver, available, full_matrix
 
 BACK_END_NAMES = available()
 TELL_INERTIA = {"pardiso", "rslab"}

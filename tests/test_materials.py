@@ -14,9 +14,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxclamp.materials import GOH, HGO, Material, NeoHookean
-from jaxclamp.pytree import concrete_subclasses
-from jaxclamp.tensors import LARGEST_EXPONENT, det, pointwise_derivatives
+from jaxclamp.core.records import concrete_subclasses
+from jaxclamp.core.tensors import LARGEST_EXPONENT, det, pointwise_derivatives
+from jaxclamp.physics.materials import GOH, HGO, Material, NeoHookean
 
 SPAN = {"kPa": (0.5, 50.0), "": (0.05, 4.0), "deg": (0.2, 1.3), "mm": (0.5, 5.0)}
 """values to draw from for a constant of each unit (radians), inside its own range"""

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import pytest
 
 import jaxclamp as jc
-from jaxclamp.assembly import assemble, cut, linearise_block, with_equilibrium_pressure
-from jaxclamp.meshes import closed_positions
-from jaxclamp.model import build_model, describe
+from jaxclamp.fem.tube import closed_positions
+from jaxclamp.potential.model import build_model, describe
+from jaxclamp.potential.tangent import assemble, cut, linearise_block, with_equilibrium_pressure
 from tube import MEDIA
 from walks import material
 

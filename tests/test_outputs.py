@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
-from jaxclamp import export, fields, paraview
-from jaxclamp.assembly import with_equilibrium_pressure
-from jaxclamp.equilibrium import EquilibriumError, NotConverged
-from jaxclamp.measures import stresses
-from jaxclamp.meshes import closed_positions
-from jaxclamp.model import build_model
-from jaxclamp.report import page, write_report
+from jaxclamp.core.failures import EquilibriumError, NotConverged
+from jaxclamp.fem.tube import closed_positions
+from jaxclamp.observe.stresses import stresses
+from jaxclamp.potential.model import build_model
+from jaxclamp.potential.tangent import with_equilibrium_pressure
+from jaxclamp.show import export, fields, paraview
+from jaxclamp.show.report import page, write_report
 
 meshio = pytest.importorskip("meshio")
 

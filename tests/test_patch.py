@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
-from jaxclamp import assembly, energies
-from jaxclamp.assembly import (
+from jaxclamp.core.tensors import stacked
+from jaxclamp.fem.tube import build_mesh
+from jaxclamp.observe.stresses import cauchy_stress
+from jaxclamp.physics.materials import HGO
+from jaxclamp.potential import densities as energies
+from jaxclamp.potential import tangent as assembly
+from jaxclamp.potential.densities import Parameters, build_geometry, build_stencils
+from jaxclamp.potential.tangent import (
     Body,
     State,
     advance,
@@ -18,12 +24,7 @@ from jaxclamp.assembly import (
     piece,
     with_equilibrium_pressure,
 )
-from jaxclamp.energies import Parameters, build_geometry, build_stencils
-from jaxclamp.linear_solvers import LinearSolver
-from jaxclamp.materials import HGO
-from jaxclamp.measures import cauchy_stress
-from jaxclamp.meshes import build_mesh
-from jaxclamp.tensors import stacked
+from jaxclamp.solve.linear_solvers import LinearSolver
 from walks import mesh
 
 MATERIAL = HGO(c=27.0, k1=5.1, k2=1.0, fibre_angle=0.5, bulk=1e4)

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 import jaxclamp as jc
-from jaxclamp.jaws import Cylinder, Flat, Jaw
+from jaxclamp.physics.jaws import Cylinder, Flat, Jaw
 from walks import mesh
 
 MESHES = {"10x15x8": (10, 15, (5, 3)), "10x30x8": (10, 30, (5, 3)), "20x30x16": (20, 30, (10, 6))}

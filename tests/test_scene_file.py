@@ -12,11 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxclamp import schema
-from jaxclamp.meshes import build_mesh, closed_radii
-from jaxclamp.presets import presets
-from jaxclamp.pytree import quantity, record, static
-from jaxclamp.scene_file import SceneError, dump_scene, load_scene, loads_scene, own_mesh_keys
+from jaxclamp.core.failures import SceneError
+from jaxclamp.core.records import quantity, record, static
+from jaxclamp.fem.tube import build_mesh, closed_radii
+from jaxclamp.scenes import schema
+from jaxclamp.scenes.files import dump_scene, load_scene, loads_scene, own_mesh_keys
+from jaxclamp.scenes.presets import presets
 
 HGO = {"law": "hgo", "c_kPa": 27.0, "k1_kPa": 0.64, "k2": 3.54, "fibre_angle_deg": 10.0, "bulk_kPa": 1e4}
 CHOICES = {"fibre_energy": "eq10", "fibre_invariant": "full"}

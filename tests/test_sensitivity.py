@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
-from jaxclamp.clamping import inflate
-from jaxclamp.scene_file import loads_scene
-from jaxclamp.sensitivity import implicit, register, see, solution
+from jaxclamp.scenes.files import loads_scene
+from jaxclamp.sensitivity.implicit import implicit, register, see, solution
+from jaxclamp.solve.clamping import inflate
 from tube import RING, Compressible
 from walks import mesh, tube_scene
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxclamp import tensors
+from jaxclamp.core import tensors
 
 LARGEST_FLOAT = 1.7e308
 matrices = np.random.default_rng(1).normal(size=(3, 3, 4, 25))

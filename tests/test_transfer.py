@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
-from jaxclamp import clamping
-from jaxclamp.assembly import State
-from jaxclamp.clamping import inflate
-from jaxclamp.equilibrium import LumenHeight, NotConverged
-from jaxclamp.meshes import closed_positions
-from jaxclamp.model import build_model
-from jaxclamp.transfer import transferred
+from jaxclamp.core.failures import NotConverged
+from jaxclamp.fem.tube import closed_positions
+from jaxclamp.potential.model import build_model
+from jaxclamp.potential.tangent import State
+from jaxclamp.solve import clamping
+from jaxclamp.solve.clamping import inflate
+from jaxclamp.solve.newton import LumenHeight
+from jaxclamp.solve.transfer import transferred
 
 
 def on_mesh(scene, **counts):

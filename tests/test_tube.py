@@ -9,8 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from jaxclamp.measures import stresses
-from jaxclamp.meshes import stress_free_positions
+from jaxclamp.fem.tube import stress_free_positions
+from jaxclamp.observe.stresses import stresses
 from tube import (
     ADVENTITIA,
     MEDIA,

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 import jaxclamp as jc
-from jaxclamp.clamping import _Walk
-from jaxclamp.equilibrium import Equilibrium
-from jaxclamp.materials import HGO, Material, NeoHookean
-from jaxclamp.model import Model, build_model
-from jaxclamp.scene import Layer, MeshSettings, Scene
+from jaxclamp.physics.materials import HGO, Material, NeoHookean
+from jaxclamp.potential.model import Model, build_model
+from jaxclamp.scenes.scene import Layer, MeshSettings, Scene
+from jaxclamp.solve.clamping import _Walk
+from jaxclamp.solve.newton import Equilibrium
 from tube import Sector
 
 

@@ -22,10 +22,10 @@ import jax.numpy as jnp
 import pytest
 
 import jaxclamp as jc
-from jaxclamp.assembly import State, linearise, with_equilibrium_pressure
-from jaxclamp.linear_solvers import LinearSolver
-from jaxclamp.meshes import closed_positions
-from jaxclamp.model import Model, build_model
+from jaxclamp.fem.tube import closed_positions
+from jaxclamp.potential.model import Model, build_model
+from jaxclamp.potential.tangent import State, linearise, with_equilibrium_pressure
+from jaxclamp.solve.linear_solvers import LinearSolver
 
 pytestmark = pytest.mark.benchmark
 

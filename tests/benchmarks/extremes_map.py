@@ -21,7 +21,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from extremes import AXES, COUNTS, Point, draw, judge, random_corners, random_points, row
-from jaxclamp.results import versions
+from jaxclamp.solve.results import versions
 
 STEPS = 7
 """values of a single axis"""

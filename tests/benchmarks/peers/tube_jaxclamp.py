@@ -22,15 +22,15 @@ import numpy as np
 import tube_work as work
 
 import jaxclamp as jc
-from jaxclamp.assembly import lumen_volume, with_equilibrium_pressure
-from jaxclamp.clamping import inflate
-from jaxclamp.equilibrium import Held, Step, System
-from jaxclamp.equilibrium import newton as own_newton
-from jaxclamp.linear_solvers import LinearSolver
-from jaxclamp.materials import HGO
-from jaxclamp.model import build_model
-from jaxclamp.results import Result
-from jaxclamp.scene import Layer, Scene
+from jaxclamp.physics.materials import HGO
+from jaxclamp.potential.model import build_model
+from jaxclamp.potential.tangent import lumen_volume, with_equilibrium_pressure
+from jaxclamp.scenes.scene import Layer, Scene
+from jaxclamp.solve.clamping import inflate
+from jaxclamp.solve.linear_solvers import LinearSolver
+from jaxclamp.solve.newton import Held, Step, System
+from jaxclamp.solve.newton import newton as own_newton
+from jaxclamp.solve.results import Result
 
 
 def tube_scene(counts: Sequence[int], tolerance: float) -> Scene:

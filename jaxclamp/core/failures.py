@@ -1,0 +1,81 @@
+"""Every way to fail, as values of one family: one sentence each, with cause and advice where there are any.
+
+Failures travel between processes: they pickle with their sentence. `exit_code` is what the command line
+answers with.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+class Failure(Exception):
+    """What went wrong, in one sentence."""
+
+    exit_code = 1
+
+
+class SceneError(Failure):
+    """A scene or study that is not valid: one sentence with file, key, value and what was expected."""
+
+    exit_code = 2
+
+
+class BadKey(Failure):
+    """One sentence on what is wrong with one key; the reader of the file adds its name (`SceneError`)."""
+
+    exit_code = 2
+
+
+class NotConverged(Failure):
+    """One attempt at an equilibrium failed; the caller cuts its step or changes its method."""
+
+    exit_code = 3
+
+    def __init__(self, reason: str, residual: float = math.nan, J_min: float = math.nan) -> None:
+        super().__init__(reason, residual, J_min)
+        self.reason, self.residual, self.J_min = reason, residual, J_min
+
+    def __str__(self) -> str:
+        return self.reason
+
+
+class Exhausted(NotConverged):
+    """Patience is out: nothing further is to be tried."""
+
+
+class EquilibriumError(Failure):
+    """No converged equilibrium. One sentence; `result` keeps the states that did converge.
+
+    `result` stays in the process it was made in: what travels is the sentence and its parts.
+    """
+
+    exit_code = 3
+
+    def __init__(self, stage: str, load: str, failure: NotConverged, advice: str) -> None:
+        super().__init__(stage, load, failure, advice)
+        self.stage, self.load, self.failure, self.advice = stage, load, failure, advice
+        self.residual, self.J_min = failure.residual, failure.J_min
+        self.result: Any = None
+
+    def __str__(self) -> str:
+        numbers = ""
+        if math.isfinite(self.residual):
+            numbers = f" (residual {self.residual:.2g} mN, smallest J {self.J_min:.3g})"
+        return f"no equilibrium in stage '{self.stage}', {self.load}: {self.failure}{numbers}; {self.advice}"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return EquilibriumError, (self.stage, self.load, self.failure, self.advice)
+
+
+class Singular(Failure):
+    """The matrix could not be factored, or its solutions are inaccurate."""
+
+    exit_code = 3
+
+
+class NoReference(Failure):
+    """The finer meshes have no solution to compare with."""
+
+    exit_code = 3

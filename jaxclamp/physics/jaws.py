@@ -1,0 +1,151 @@
+"""Rigid jaws as gap functions. A jaw sees one point; it has no mesh.
+
+Jaw coordinates: the origin is the jaw's lowest point above mid-length, x runs across the artery,
+y up into the jaw, z along the artery. `gap(point)` is the signed distance, positive outside: zero
+on the face and exact to first order around it (within 0.3 % in the short blends between the parts
+of a face), with continuous second derivative.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxclamp.core.records import quantity, record, static
+from jaxclamp.core.tensors import Vector, half_square, norm, ramp
+
+
+class Jaw(abc.ABC):
+    """A rigid jaw. A shape is one record with its floats, and `gap`."""
+
+    shape: str
+
+    @abc.abstractmethod
+    def gap(self, point: Vector) -> Array:
+        """Signed distance of `point` (x, y, z, each (*batch)) from the face, mm; positive outside."""
+
+    @abc.abstractmethod
+    def half_extent(self) -> Array:
+        """Distance along the artery from the jaw's middle to its side, mm."""
+
+    @abc.abstractmethod
+    def curvatures(self) -> Array:
+        """Greatest curvatures of the parts of the face, 1/mm, convex ones positive, (n_parts,)."""
+
+    def least_radius(self) -> Array:
+        """Least radius of curvature of the convex parts of the face, mm (an estimate for meshing)."""
+        return 1.0 / jnp.maximum(jnp.max(self.curvatures()), 1e-12)
+
+
+@record
+class Cylinder(Jaw):
+    """A round bar across the artery."""
+
+    shape: str = static("cylinder")
+    radius: Array = quantity("mm", 0.0, 1e4, open_lower=True)
+    """radius of the bar"""
+
+    def gap(self, point: Vector) -> Array:
+        return norm((point[1] - self.radius, point[2])) - self.radius
+
+    def half_extent(self) -> Array:
+        return jnp.asarray(self.radius)
+
+    def curvatures(self) -> Array:
+        return jnp.reshape(1.0 / self.radius, 1)
+
+
+@record
+class Flat(Jaw):
+    """A flat face with rounded edges."""
+
+    shape: str = static("flat")
+    half_width: Array = quantity("mm", 0.0, 1e3, open_lower=True)
+    """half the width of the flat part, along the artery; the edges come on top"""
+    edge_radius: Array = quantity("mm", 0.0, 1e3, open_lower=True)
+    """radius of the rounding from the flat part to the side"""
+
+    def gap(self, point: Vector) -> Array:
+        return _rounded(jnp.abs(point[2]) - self.half_width, point[1], self.half_width, self.edge_radius)
+
+    def half_extent(self) -> Array:
+        return jnp.asarray(self.half_width + self.edge_radius)
+
+    def curvatures(self) -> Array:
+        return jnp.reshape(1.0 / self.edge_radius, 1)
+
+
+@record
+class Spline(Jaw):
+    """A smooth profile y = h(z), symmetric about the middle, with rounded edges.
+
+    The slope h' is the quadratic B-spline over equally spaced stations z_i = i d, i = 0..n, with
+    d = half_width / (n + 1/2), whose control values are 0 in the middle and `slopes` beyond. It
+    reaches the last slope at the profile's end, without curvature, so that the rounding starts
+    from a straight line. It stays inside the control polygon's range, h is convex where the
+    slopes rise, and the steepest rise between two stations bounds the curvature:
+    |h''| <= max |s_(i+1) - s_i| / d. Off the face the second derivative of the gap jumps at
+    (i + 1/2) d by the order of the gap itself: nothing on the face, next to nothing beside it.
+    """
+
+    shape: str = static("spline")
+    half_width: Array = quantity("mm", 0.0, 1e3, open_lower=True)
+    """half the width of the profile, along the artery; the edges come on top"""
+    slopes: Array = quantity("", -20.0, 20.0, many=True)
+    """control values of h' at the stations beside the middle; the last is the slope at the end, (n,)"""
+    edge_radius: Array = quantity("mm", 0.0, 1e3, open_lower=True)
+    """radius of the rounding from the profile's end to the side"""
+
+    def _control(self) -> Array:
+        """Control values of h' at all stations, (n + 1,)."""
+        return jnp.concatenate([jnp.zeros(1), jnp.asarray(self.slopes)])
+
+    def _spacing(self) -> Array:
+        """Distance between stations, mm."""
+        return self.half_width / (jnp.shape(self.slopes)[0] + 0.5)
+
+    def height(self, z: Array | np.ndarray) -> tuple[Array, Array]:
+        """h (mm) and h' at distances z (*batch) from the middle, z >= 0; straight past the end."""
+        spacing = self._spacing()
+        control = self._control()
+        n = control.shape[0] - 1
+        kinks = jnp.diff(jnp.append(jnp.diff(control), 0.0))  # of the polygon, at stations 1..n
+        t = jnp.asarray(z) / spacing
+        u = t[None] - jnp.arange(1.0, n + 1.0).reshape(n, *[1] * t.ndim)
+        kinks = kinks.reshape(u.shape[:1] + (1,) * t.ndim)
+        # half_square(u, 1/2) is max(u, 0)**2 / 2 averaged over a station's width: a cubic B-spline
+        height = control[1] * t * t / 2.0 + jnp.sum(kinks * half_square(u, 0.5), axis=0)
+        v = jnp.clip(u, -0.5, 0.5) + 0.5
+        slope = control[1] * t + jnp.sum(kinks * jnp.where(u < 0.5, v * v / 2.0, u), axis=0)
+        return spacing * height, slope
+
+    def gap(self, point: Vector) -> Array:
+        y, z = point[1], jnp.abs(point[2])
+        h, slope = self.height(z)
+        end_h, end_slope = self.height(jnp.asarray(self.half_width))
+        above = (y - h) / jnp.sqrt(1.0 + slope**2)
+        past_end = (z - self.half_width + end_slope * (y - end_h)) / jnp.sqrt(1.0 + end_slope**2)
+        return _rounded(past_end, above, self.half_width, self.edge_radius)
+
+    def half_extent(self) -> Array:
+        return jnp.asarray(self.half_width + self.edge_radius)
+
+    def curvatures(self) -> Array:
+        bends = jnp.diff(self._control()) / self._spacing()
+        return jnp.append(bends, 1.0 / self.edge_radius)
+
+
+def _rounded(past_end: Array, above: Array, half_width: Array, radius: Array) -> Array:
+    """Signed distance from the corner region {past_end < 0, above > 0}, rounded by `radius` outside.
+
+    past_end, above: orthogonal coordinates along and into the face, mm. The face meets the
+    quarter circle with continuous curvature, spread over a quarter of the radius or less.
+    """
+    width = 1.0 / (4.0 / radius + 1.0 / half_width)
+    a, b = past_end, radius - above
+    nearest_side = b + ramp(a - b, width)
+    outside = norm((ramp(a, width), ramp(b, width)))
+    return outside - radius - ramp(-nearest_side, width)

@@ -1,0 +1,205 @@
+"""What makes a scene impossible although each of its values is sensible on its own.
+
+The checks read the floats of a scene that was just read from a file; `schema.BadKey` says what
+is wrong with which key.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from jaxclamp.core.failures import BadKey
+from jaxclamp.core.records import UNIT_FACTOR
+from jaxclamp.physics.jaws import Spline
+from jaxclamp.scenes import schema
+from jaxclamp.scenes.scene import Layer, Scene, TravelStop
+from jaxclamp.scenes.schema import refuse
+
+MOST_CELLS = 200_000
+COUNTS = {"circumferential": (2, 400), "axial": (2, 400), "contact_points": (1, 20)}
+RADIAL_COUNTS = (1, 100)
+TOLERANCES = (1e-13, 1e-2)
+
+CLOSING_STRETCHES = (0.5, 2.0)
+"""circumferential stretch with which a layer may close round the one inside"""
+TRAVELS = (0.0, 3.0)
+"""a jaw's travel over the widest outer radius: the jaws have met well before"""
+
+THICKNESSES = (1e-3, 10.0)
+"""a layer's thickness over its inner radius"""
+LENGTHS = (0.1, 1e4)
+"""the artery's length over the widest outer radius"""
+JAW_SIZES = (1e-3, 1e4)
+"""a jaw's lengths over the widest outer radius"""
+SMOOTHINGS = (1e-6, 1.0)
+"""the smoothing of contact over the thickness of the wall"""
+
+
+def check(scene: Scene) -> None:
+    """Raise BadKey for the first thing that is impossible."""
+    checks = (
+        check_names,
+        check_proportions,
+        check_closing,
+        check_jaw,
+        check_mesh,
+        check_travel,
+        check_solver,
+    )
+    for one in checks:
+        one(scene)
+
+
+def check_signs(record: Any, path: str = "") -> None:
+    """Every quantity is finite, and positive where it has to be.
+
+    Less than the ranges of a file: differences, and studies of one's own, may step over their ends.
+    """
+    for field in dataclasses.fields(record):
+        value, name = getattr(record, field.name), schema.join(path, schema.file_key(field))
+        if "range" in field.metadata:
+            interval = field.metadata["range"]
+            numbers = np.atleast_1d(np.asarray(value, float))
+            positive = interval.open_lower and interval.lower == 0.0
+            if not np.all(np.isfinite(numbers)) or (positive and not np.all(numbers > 0.0)):
+                shown = np.asarray(value, float) / UNIT_FACTOR[interval.unit]
+                raise refuse(name, shown.tolist(), str(interval))
+        elif isinstance(value, tuple):
+            parts = [(part, f"{name}[{i}]") for i, part in enumerate(value)]
+            for part, where in parts:
+                if dataclasses.is_dataclass(part):
+                    check_signs(part, where)
+        elif dataclasses.is_dataclass(value):
+            check_signs(value, name)
+
+
+def check_names(scene: Scene) -> None:
+    """Every layer has a name of its own."""
+    names: list[str] = []
+    for i, layer in enumerate(scene.artery.layers):
+        path = f"artery.layers[{i}].name"
+        if not layer.name.strip():
+            raise refuse(path, layer.name, "a name that is not empty")
+        if layer.name in names:
+            raise refuse(path, layer.name, "a name that no other layer has")
+        names.append(layer.name)
+
+
+def check_proportions(scene: Scene) -> None:
+    """Lengths are in proportion to each other."""
+    layers, jaw = scene.artery.layers, scene.clamp.jaw
+    for i, layer in enumerate(layers):
+        path = f"artery.layers[{i}]"
+        inner = f"{path}.inner_radius_mm", layer.inner_radius
+        _check_ratio(f"{path}.thickness_mm", layer.thickness, THICKNESSES, inner)
+    _check_ratio("artery.length_mm", scene.artery.length, LENGTHS, _widest(scene))
+    for key, field in schema.fields_by_key(type(jaw)).items():
+        if "range" in field.metadata and field.metadata["range"].unit == "mm" and not field.metadata["many"]:
+            _check_ratio(f"clamp.jaw.{key}", getattr(jaw, field.name), JAW_SIZES, _widest(scene))
+    wall = "the thickness of the wall", sum(float(layer.thickness) for layer in layers)
+    _check_ratio("contact.smoothing_mm", scene.contact.smoothing, SMOOTHINGS, wall)
+
+
+def _widest(scene: Scene) -> tuple[str, float]:
+    """Largest outer radius of the open sectors, mm, with its name."""
+    radii = [float(layer.inner_radius + layer.thickness) for layer in scene.artery.layers]
+    return "the widest layer's outer radius", max(radii)
+
+
+def check_closing(scene: Scene) -> None:
+    """Every layer's open sector closes to a ring, round the one inside."""
+    inner_squared: float | None = None
+    for i, layer in enumerate(scene.artery.layers):
+        inner_squared, stretch = _close(layer, inner_squared, f"artery.layers[{i}].opening_angle_deg")
+        least, most = CLOSING_STRETCHES
+        if not least <= stretch <= most:
+            raise refuse(
+                f"artery.layers[{i}].inner_radius_mm",
+                float(layer.inner_radius),
+                f"a sector that closes round the layer inside: round the circumference {layer.name!r} "
+                f"would be stretched {stretch:.3g}-fold, not {least:g} to {most:g}",
+            )
+
+
+def _close(layer: Layer, inner_squared: float | None, path: str) -> tuple[float, float]:
+    """Square of the closed outer radius (mm2) and mean circumferential stretch of one layer.
+
+    The map of `meshes.closed_radii`: r**2 = r_i**2 + (R**2 - R_i**2) / k, where the innermost
+    layer (`inner_squared` None) keeps the length of its middle surface.
+    """
+    degrees = float(layer.opening_angle) / UNIT_FACTOR["deg"]
+    share = 1.0 - degrees / 360.0
+    inner, thickness = float(layer.inner_radius), float(layer.thickness)
+    middle, outer = inner + 0.5 * thickness, inner + thickness
+    if inner_squared is None:
+        inner_squared = (middle * share) ** 2 - (middle**2 - inner**2) * share
+    if share <= 0.0 or inner_squared <= 0.0:
+        raise refuse(
+            path,
+            round(degrees, 9),
+            f"an angle with which {layer.name!r} can close: its sector is too short to make a ring "
+            f"of {thickness:g} mm thickness",
+        )
+    outer_squared = inner_squared + (outer**2 - inner**2) * share
+    middle_squared = inner_squared + (middle**2 - inner**2) * share
+    return outer_squared, middle_squared**0.5 / (share * middle)
+
+
+def check_mesh(scene: Scene) -> None:
+    """The counts are sensible, together too, and there is one for each layer."""
+    mesh, layers = scene.mesh, scene.artery.layers
+    for key, (least, most) in COUNTS.items():
+        _check_between(f"mesh.{key}", getattr(mesh, key), least, most, "a whole number")
+    if len(mesh.radial) != len(layers):
+        names = ", ".join(layer.name for layer in layers)
+        raise refuse(
+            "mesh.radial", list(mesh.radial), f"one count for each of {len(layers)} layers ({names})"
+        )
+    for i, count in enumerate(mesh.radial):
+        _check_between(f"mesh.radial[{i}]", count, *RADIAL_COUNTS, "a whole number")
+    through = sum(mesh.radial)
+    cells = mesh.circumferential * mesh.axial * through
+    if cells > MOST_CELLS:
+        said = f"mesh has {mesh.circumferential} x {mesh.axial} x {through} = {cells} elements"
+        raise BadKey(f"{said}: expected at most {MOST_CELLS}")
+
+
+def check_travel(scene: Scene) -> None:
+    """The jaws do not travel far beyond the artery."""
+    if isinstance(scene.stop, TravelStop):
+        _check_ratio("stop.travel_mm", scene.stop.travel, TRAVELS, _widest(scene))
+
+
+def check_jaw(scene: Scene) -> None:
+    """The middle of the jaw is its lowest point, as travel and first contact assume."""
+    jaw = scene.clamp.jaw
+    if isinstance(jaw, Spline):
+        height = np.asarray(jaw.height(np.linspace(0.0, float(jaw.half_width), 200))[0])
+        if np.min(height) < -1e-9 * float(jaw.half_width):
+            raise refuse(
+                "clamp.jaw.slopes",
+                np.asarray(jaw.slopes).tolist(),
+                "slopes that keep the middle the lowest point of the jaw; "
+                f"here it lies {-np.min(height):.3g} mm above the lowest",
+            )
+
+
+def check_solver(scene: Scene) -> None:
+    """The tolerance is within what float64 can do."""
+    _check_between("solver.tolerance", scene.solver.tolerance, *TOLERANCES, "a number")
+
+
+def _check_ratio(path: str, value: Any, ratios: tuple[float, float], beside: tuple[str, Any]) -> None:
+    """A length in proportion to another, `beside`; both mm."""
+    name, other = beside[0], float(beside[1])
+    least, most = (ratio * other for ratio in ratios)
+    if not least <= value <= most:
+        raise refuse(path, float(value), f"a number from {least:g} to {most:g} beside {name} = {other:g} mm")
+
+
+def _check_between(path: str, value: Any, least: float, most: float, what: str) -> None:
+    if not least <= value <= most:
+        raise refuse(path, value, f"{what} from {least:g} to {most:g}")

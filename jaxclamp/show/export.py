@@ -1,0 +1,157 @@
+"""Everything a clamping leaves on disk, written whole or not at all.
+
+result.json, history.csv, clamping.pvd with paraview/*.vtu, figures/*.png and report.html. All
+files are made in a temporary folder inside the target and then renamed into place, so that a
+full disk or an interruption leaves the target as it was.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxclamp.show.console import as_json
+from jaxclamp.show.paraview import FOLDER as STATES
+from jaxclamp.show.paraview import write_states
+
+if TYPE_CHECKING:
+    from jaxclamp.core.progress import Progress
+    from jaxclamp.core.progress import Progress as Event
+    from jaxclamp.show.plots import Plate
+    from jaxclamp.solve.results import Result
+
+STAGING = ".jaxclamp-writing-"
+FIGURES = "figures"
+
+
+def write_outputs(
+    result: Result, folder: str | Path, progress: Callable[[Progress], None] | None = None
+) -> list[Path]:
+    """Write all outputs of a result into `folder` (made if missing); returns the files.
+
+    Works for whatever states converged. Files of an earlier result in the same folder are
+    replaced, and its further states removed. Raises OSError, with nothing half written.
+    """
+
+    folder = Path(folder)
+    tell = lambda fraction, message: progress and progress(Event("writing", fraction, message))  # noqa: E731
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=STAGING, dir=folder) as staging:
+            written = list(_write_all(result, Path(staging), tell))
+            files = into_place(Path(staging), folder, written)
+            _remove_old(folder, files)
+    except BaseException:
+        for path in missing:
+            with suppress(OSError):
+                path.rmdir()
+        raise
+    tell(1.0, f"{len(files)} files in {folder}")
+    return files
+
+
+def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) -> Iterator[Path]:
+    """Write every output into an empty folder."""
+    if result.load_free is not None:
+        yield from write_states(result, folder, lambda s, said: tell(0.5 * s, said))
+    plates: list[tuple[Plate, bytes]] = []
+    (folder / FIGURES).mkdir()
+    from jaxclamp.show.plots import figures, png
+
+    for plate in figures(result):
+        tell(0.5 + 0.1 * len(plates), plate.title.lower())
+        plates.append((plate, png(plate.figure)))
+        path = folder / FIGURES / f"{plate.name}.png"
+        path.write_bytes(plates[-1][1])
+        yield path
+    history = folder / "history.csv"
+    history.write_text(history_csv(result.history), encoding="utf-8", newline="")
+    yield history
+    from jaxclamp.show.report import write_report
+
+    yield write_report(result, folder / "report.html", plates)
+    final = folder / "result.json"
+    final.write_text(as_json(plain(result.to_dict())) + "\n", encoding="utf-8")
+    yield final
+
+
+def into_place(staging: Path, folder: Path, written: list[Path]) -> list[Path]:
+    """Rename finished files from a temporary folder into their own; returns them there."""
+    for path in written:
+        with path.open("r+b") as file:  # a disk that fills up late says so here
+            os.fsync(file.fileno())
+    names = [path.relative_to(staging) for path in written]
+    for parent in {(folder / name).parent for name in names}:
+        parent.mkdir(exist_ok=True)
+    for name in names:
+        os.replace(staging / name, folder / name)
+    return [folder / name for name in names]
+
+
+def _remove_old(folder: Path, files: list[Path]) -> None:
+    """Remove what an earlier result with more states left over."""
+    for old in _own_files(folder):
+        if old not in files:
+            old.unlink()
+
+
+def _own_files(folder: Path) -> Iterator[Path]:
+    """The states and figures in a folder that bear names given here; a user's own files are others."""
+    from jaxclamp.show.plots import PLATES
+
+    for part in ("artery", "jaws"):
+        yield from (folder / STATES).glob(f"{part}_[0-9][0-9][0-9].vtu")
+    yield from (path for name, *_ in PLATES if (path := folder / FIGURES / f"{name}.png").exists())
+
+
+# --------------------------------------------------------------------------------- plain content
+
+
+def plain(content: Any) -> Any:
+    """The same with Python's own numbers, lists and dicts only."""
+    if isinstance(content, dict):
+        return {str(key): plain(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [plain(value) for value in content]
+    if hasattr(content, "tolist"):  # numpy and JAX arrays and scalars
+        return np.asarray(content).tolist()
+    return content
+
+
+def history_csv(history: list[dict[str, Any]]) -> str:
+    """One row per state; columns of layers are called KEY.LAYER, of places KEY.LAYER.x and so on."""
+    rows = [dict(_flat(plain(record))) for record in history]
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, ["state", *columns], restval="", lineterminator="\n")
+    writer.writeheader()
+    for number, row in enumerate(rows):
+        writer.writerow({"state": number, **{name: _cell(value) for name, value in row.items()}})
+    return buffer.getvalue()
+
+
+def _flat(record: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in record.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif isinstance(value, list):
+            yield from ((f"{prefix}{key}.{axis}", v) for axis, v in zip("xyz", value, strict=False))
+        else:
+            yield prefix + key, value
+
+
+def _cell(value: Any) -> Any:
+    """Nothing for what is not a number; full precision for what is."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return ""
+    return value

@@ -1,0 +1,134 @@
+"""Every kept state as ParaView files: the artery and the jaws, and one index that opens them all.
+
+The index `clamping.pvd` is a time series over the states in order (time 0 is the load-free state)
+with two parts, the artery and the jaws. All lengths mm, all stresses kPa.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from jaxclamp.fem.tube import Mesh
+from jaxclamp.show.fields import jaw_height_shown, jaw_outline, layer_fields, whole
+
+if TYPE_CHECKING:
+    from jaxclamp.solve.results import Kept, Result
+
+INDEX = "clamping.pvd"
+FOLDER = "paraview"
+LARGEST_WHOLE = 200_000
+"""cells; a finer artery is written as the modelled eighth"""
+SIDE_MARGIN = 1.15
+"""half the width of the drawn jaws over that of the widest artery"""
+
+
+def write_states(
+    result: Result, folder: Path, tell: Callable[[float, str], None] = lambda fraction, message: None
+) -> list[Path]:
+    """Write all states into `folder`; returns the files, the index last."""
+    import meshio
+
+    (folder / FOLDER).mkdir(exist_ok=True)
+    mesh = result.model.mesh
+    full = is_whole(mesh)
+    outline = jaw_outline(result.scene.clamp.jaw, 2.0 * _widest(result))
+    index: list[tuple[int, str, str]] = []
+    for number, kept in enumerate(result.states):
+        tell(number / len(result.states), f"state {number + 1} of {len(result.states)}")
+        for part, made in (
+            ("artery", artery_mesh(result, kept, full)),
+            ("jaws", jaw_mesh(result, kept, outline, full)),
+        ):
+            name = f"{FOLDER}/{part}_{number:03d}.vtu"
+            meshio.write(folder / name, made, compression="zlib")
+            index.append((number, part, name))
+    (folder / INDEX).write_text(pvd(index), encoding="utf-8")
+    return [*(folder / name for _, _, name in index), folder / INDEX]
+
+
+def is_whole(mesh: Mesh) -> bool:
+    """True if files show the whole artery, False if only the modelled eighth."""
+    return 8 * mesh.n_cells <= LARGEST_WHOLE
+
+
+def pvd(index: list[tuple[int, str, str]]) -> str:
+    """The text of a ParaView collection; index: (time, part, file)."""
+    parts = sorted({part for _, part, _ in index})
+    rows = [
+        f'    <DataSet timestep="{time}" group="" part="{parts.index(part)}" name={quoteattr(part)} '
+        f"file={quoteattr(name)}/>"
+        for time, part, name in index
+    ]
+    return "\n".join(
+        [
+            '<?xml version="1.0" encoding="utf-8"?>',
+            '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">',
+            "  <Collection>",
+            *rows,
+            "  </Collection>",
+            "</VTKFile>",
+            "",
+        ]
+    )
+
+
+def artery_mesh(result: Result, kept: Kept, full: bool = True) -> Any:
+    """A state of the wall as a meshio mesh: one block of hexahedra, points doubled at interfaces."""
+    import meshio
+
+    assert result.load_free is not None
+    layers = layer_fields(result.model, kept.state, result.load_free.state)
+    if full:
+        layers = tuple(whole(layer) for layer in layers)
+    element = result.model.mesh.element
+    starts = np.cumsum([0, *(len(layer.points) for layer in layers)])
+    cells = [layer.cells + start for layer, start in zip(layers, starts, strict=False)]
+    corners = np.concatenate(cells, axis=1)[list(element.meshio_nodes)].T
+    return meshio.Mesh(
+        np.concatenate([layer.points for layer in layers]),
+        [(element.meshio_name, corners)],
+        point_data=_joined([layer.point_data for layer in layers]),
+        cell_data={name: [v] for name, v in _joined([layer.cell_data for layer in layers]).items()},
+    )
+
+
+def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True) -> Any:
+    """Both jaws of a state (only the upper one with the modelled eighth) as a meshio mesh of quadrilaterals.
+
+    outline: closed curve (z, y) of the jaw, mm, from `jaw_outline`
+    """
+    import meshio
+
+    physiological = result.physiological
+    open_height = None if physiological is None else physiological.values["outer_radius_mm"]
+    height = jaw_height_shown(result.model, kept.state, open_height)
+    half_width = SIDE_MARGIN * _widest(result)
+    z, y = outline[:-1].T
+    n = len(z)
+    upper = np.concatenate(
+        [np.stack([np.full(n, x), height + y, z], axis=1) for x in (-half_width, half_width)]
+    )
+    around = np.arange(n)
+    following = (around + 1) % n
+    quads = np.stack([around, following, n + following, n + around], axis=1)
+    points, cells, jaw = upper, quads, np.zeros(n, dtype=int)
+    if full:
+        points = np.concatenate([upper, upper * [1.0, -1.0, 1.0]])
+        cells = np.concatenate([quads, quads[:, ::-1] + len(upper)])
+        jaw = np.repeat([0, 1], n)
+    return meshio.Mesh(points, [("quad", cells)], cell_data={"jaw": [jaw]})
+
+
+def _widest(result: Result) -> float:
+    """Half the width of the artery where and when it is widest, mm."""
+    nodes = result.model.mesh.plane(0, -1)
+    return max(float(np.max(np.asarray(kept.state.x)[nodes, 0])) for kept in result.states)

@@ -1,0 +1,87 @@
+"""Figures of a clamping: each a function of the result that returns a matplotlib figure.
+
+Figures touch no global state of matplotlib. `figures(result)` makes all that the result allows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+from jaxclamp.show.plots.curves import plot_force_travel, plot_stress_at_P
+from jaxclamp.show.plots.maps import plot_axial_stress_maps
+from jaxclamp.show.plots.sections import plot_sections
+from jaxclamp.show.plots.states import Clamped
+from jaxclamp.show.plots.style import Picture, png
+from jaxclamp.show.plots.wall import plot_wall_stress
+
+__all__ = [
+    "Picture",
+    "Plate",
+    "figures",
+    "plot_axial_stress_maps",
+    "plot_force_travel",
+    "plot_sections",
+    "plot_stress_at_P",
+    "plot_wall_stress",
+    "png",
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Plate:
+    """A figure with its name (of a file, without suffix), title and caption."""
+
+    name: str
+    title: str
+    caption: str
+    figure: Picture
+
+
+PLATES = (
+    (
+        "wall_stress",
+        "Stress through the wall",
+        "Circumferential and axial Cauchy stress along the compression axis at mid-length, "
+        "extrapolated to the nodes and averaged within each layer: residual stress alone (left), "
+        "and under blood pressure and axial stretch (right).",
+        plot_wall_stress,
+    ),
+    (
+        "sections",
+        "Deformed sections",
+        "Cross-section at mid-length and section along the artery, with the elements and the jaws, "
+        "from the artery in the body (A) to the last state.",
+        plot_sections,
+    ),
+    (
+        "stress_at_P",
+        "Stress at P",
+        "Axial and circumferential stress at P, the inner surface under the middle of the jaw, over "
+        "their values in the body; letters mark the sections shown.",
+        plot_stress_at_P,
+    ),
+    (
+        "axial_stress_maps",
+        "Axial stress in the layers",
+        "Axial Cauchy stress in the last state: each layer unrolled, with the highest value through "
+        "its thickness (left; a cross marks the highest of all), and as it lies under the jaw (right).",
+        plot_axial_stress_maps,
+    ),
+    (
+        "force_travel",
+        "Force and occlusion",
+        "Force on one jaw, and occlusion of the lumen by height and by area, against the travel of "
+        "each jaw from first contact.",
+        plot_force_travel,
+    ),
+)
+
+
+def figures(result: Clamped) -> Iterator[Plate]:
+    """Every figure that the converged states allow, one at a time."""
+    for name, title, caption, draw in PLATES:
+        needs_clamping = draw is not plot_wall_stress
+        if result.load_free is None or (needs_clamping and result.physiological is None):
+            continue
+        yield Plate(name, title, caption, draw(result))

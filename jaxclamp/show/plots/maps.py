@@ -1,0 +1,211 @@
+"""Where the axial stress is high at the end: every layer unrolled, and as it lies under the jaw."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.patheffects import AbstractPathEffect, withStroke
+
+from jaxclamp.show.fields import LayerFields, layer_fields, layer_nodes
+from jaxclamp.show.plots.states import Clamped, final_state
+from jaxclamp.show.plots.style import INK, NORMAL, SMALL, Picture, dress, nice_limits, plain, stress_colours
+
+FIELD = "axial_stress_kPa"
+FROM_INSIDE, FROM_OUTSIDE = (0.50, -0.75, 0.32), (0.50, 0.75, 0.32)
+"""where the observer stands: across the artery, above the jaws' mid-plane, along the artery"""
+FINER = 4
+"""drawn facets per facet of the mesh and direction"""
+
+
+def plot_axial_stress_maps(result: Clamped) -> Picture:
+    """Axial Cauchy stress of every layer in the last state, on one colour scale."""
+    kept = final_state(result)
+    layers = layer_fields(result.model, kept.state)
+    zoom = half_length_shown(result, layers)
+    limits = nice_limits(
+        [layer.point_data[FIELD][np.abs(layer.points[:, 2]) <= zoom] for layer in layers], 5.0
+    )
+    scale = ScalarMappable(Normalize(*limits), stress_colours())
+    figure = Picture(9.6, 2.75 * len(layers) + 0.35)
+    grid = figure.add_gridspec(len(layers), 2, width_ratios=[1.0, 1.25])
+    for number, layer in enumerate(layers):
+        first, end = result.model.mesh.layer_cells[number]
+        P = first <= result.model.marks.P_cell < end
+        map_axes, view_axes = (figure.add_subplot(grid[number, column]) for column in (0, 1))
+        unrolled(map_axes, layer, load_free_angles(result, number), zoom, scale, P)
+        last = number == len(layers) - 1
+        dress(
+            map_axes,
+            "position along the artery (mm)" if last else "",
+            "angle from the fold (deg)",
+            f"{plain(layer.name)}, highest through the layer",
+            grid=False,
+        )
+        _view(view_axes, layer, zoom, scale, inside=number == 0, mark_P=P)
+    bar = figure.colorbar(scale, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
+    bar.set_label("axial Cauchy stress (kPa)", fontsize=NORMAL, color=INK)
+    bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
+    bar.outline.set_visible(False)
+    return figure
+
+
+def half_length_shown(result: Clamped, layers: tuple[LayerFields, ...]) -> float:
+    """Half the length of artery shown, mm."""
+    size = float(np.max(layers[-1].points[:, 0]))
+    end = float(np.max(layers[-1].points[:, 2]))
+    return min(float(result.scene.clamp.jaw.half_extent()) + size, 2.5 * size, end)
+
+
+# --------------------------------------------------------------------------------- unrolled
+
+
+def load_free_angles(result: Clamped, layer: int) -> np.ndarray:
+    """Angle of the circumferential grid lines in the load-free tube, deg, (n_c,)."""
+    assert result.load_free is not None
+    grid = result.model.mesh.grid
+    x = np.asarray(result.load_free.state.x)[layer_nodes(result.model.mesh, layer)]
+    quarter = x.reshape(grid[2], grid[1], -1, 3)[0, :, 0]
+    return np.degrees(np.arctan2(quarter[:, 1], quarter[:, 0]))
+
+
+def unrolled(
+    axes: Axes, layer: LayerFields, angles: np.ndarray, zoom: float, scale: ScalarMappable, mark_P: bool
+) -> None:
+    """Angle in the load-free tube (fold, jaw, fold) against current position along the artery."""
+    stress = layer.on_grid(layer.point_data[FIELD])
+    highest = np.argmax(stress, axis=2)[..., None]
+    value = np.take_along_axis(stress, highest, axis=2)[..., 0]
+    z = np.take_along_axis(layer.on_grid(layer.points)[..., 2], highest, axis=2)[..., 0]
+    angle = np.broadcast_to(angles, value.shape)
+    place = np.unravel_index(np.argmax(np.where(z <= zoom, value, -np.inf)), value.shape)
+    peaks = [(side * z[place], a) for side in (1, -1) for a in (angle[place], 180.0 - angle[place])]
+
+    value, z, angle = (np.concatenate([sign * v[:0:-1], v]) for v, sign in ((value, 1), (z, -1), (angle, 1)))
+    value, z, angle = (
+        np.concatenate([v, w[:, -2::-1]], axis=1) for v, w in ((value, value), (z, z), (angle, 180.0 - angle))
+    )
+    axes.pcolormesh(
+        z,
+        angle,
+        value,
+        cmap=scale.cmap,
+        norm=Normalize(*scale.get_clim()),
+        shading="gouraud",
+        rasterized=True,
+    )
+    axes.set_xlim(-zoom, zoom)
+    axes.set_ylim(0.0, 180.0)
+    axes.set_yticks([0, 45, 90, 135, 180], ["0, fold", "45", "90, jaw", "135", "180, fold"])
+    axes.plot(
+        *np.transpose(peaks), "x", color="white", markersize=6, markeredgewidth=1.6, path_effects=_outlined()
+    )
+    if mark_P:
+        _P(axes, 0.0, 90.0)
+
+
+def _outlined() -> list[AbstractPathEffect]:
+    """White marks with a dark rim, seen on any colour."""
+    return [withStroke(linewidth=3.0, foreground=INK)]
+
+
+def _P(axes: Axes, x: float, y: float) -> None:
+    axes.plot(x, y, "o", markersize=5, markerfacecolor="white", markeredgecolor=INK, markeredgewidth=1.0)
+    axes.annotate(
+        "P",
+        (x, y),
+        (5, 5),
+        textcoords="offset points",
+        fontsize=NORMAL,
+        color="white",
+        weight="bold",
+        path_effects=_outlined(),
+    )
+
+
+# --------------------------------------------------------------------------------- seen in space
+
+
+def _view(
+    axes: Axes, layer: LayerFields, zoom: float, scale: ScalarMappable, inside: bool, mark_P: bool
+) -> None:
+    """The upper half of a layer, shaded, from the lumen or from outside."""
+    camera = _camera(FROM_INSIDE if inside else FROM_OUTSIDE)
+    quads, values = _shell(layer, zoom)
+    normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    toward = normal @ camera[2]
+    light = camera.T @ np.array([-0.35, 0.45, 0.82])
+    seen = toward > 0.0
+    depth = np.mean(quads, axis=1) @ camera[2]
+    order = np.flatnonzero(seen)[np.argsort(depth[seen])]
+    shade = 0.75 + 0.25 * np.clip(normal @ light, 0.0, 1.0)
+    colours = scale.to_rgba(values)[order]
+    colours[:, :3] *= shade[order, None]
+    flat = quads[order] @ camera[:2].T
+    axes.add_collection(
+        PolyCollection(flat, facecolors=colours, edgecolors=colours, linewidths=0.3, rasterized=True)
+    )
+    low, high = flat.min(axis=(0, 1)), flat.max(axis=(0, 1))
+    margin = 0.03 * (high - low)
+    axes.set_xlim(low[0] - margin[0], high[0] + margin[0])
+    axes.set_ylim(low[1] - margin[1], high[1] + margin[1])
+    axes.set_aspect("equal")
+    axes.set_anchor("NW")
+    axes.set_axis_off()
+    axes.set_title(
+        "upper half, seen from the lumen" if inside else "upper half, seen from outside",
+        fontsize=NORMAL,
+        color=INK,
+        loc="left",
+    )
+    if mark_P and inside:
+        P = layer.on_grid(layer.points)[0, -1, 0]
+        _P(axes, *(camera[:2] @ P))
+
+
+def _camera(toward: tuple[float, float, float]) -> np.ndarray:
+    """Rows: right, up, towards the observer; the artery runs from left to right."""
+    back = np.array(toward) / np.linalg.norm(toward)
+    right = np.array([0.0, 0.0, -1.0]) if toward[0] > 0.0 else np.array([0.0, 0.0, 1.0])
+    right -= (right @ back) * back
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back])
+
+
+def _shell(layer: LayerFields, zoom: float) -> tuple[np.ndarray, np.ndarray]:
+    """Facets of the upper half's surface: corners anticlockwise from outside (n, 4, 3), values (n,)."""
+    block = np.concatenate(
+        [layer.on_grid(layer.points), layer.on_grid(layer.point_data[FIELD])[..., None]], axis=-1
+    )
+    block = np.concatenate([block[:0:-1] * [1, 1, -1, 1], block])
+    block = np.concatenate([block, block[:, -2::-1] * [-1, 1, 1, 1]], axis=1)
+    block = _refined(_refined(block, 0), 1)
+    keep = np.flatnonzero(np.max(np.abs(block[..., 2]), axis=(1, 2)) <= zoom)
+    block = block[keep[0] : keep[-1] + 1]
+    sheets = [
+        block[:, ::-1, 0],
+        block[:, :, -1],
+        block[:, 0],
+        block[:, -1, ::-1],
+        block[0, ::-1],
+        block[-1],
+    ]
+    quads = np.concatenate([_quads(sheet) for sheet in sheets])
+    return quads[..., :3], np.mean(quads[..., 3], axis=1)
+
+
+def _refined(block: np.ndarray, axis: int) -> np.ndarray:
+    """Values at FINER times as many places along an axis, straight in between."""
+    a = np.moveaxis(block, axis, 0)
+    s = (np.arange(FINER) / FINER).reshape(1, -1, *[1] * (a.ndim - 1))
+    fine = ((1.0 - s) * a[:-1, None] + s * a[1:, None]).reshape(-1, *a.shape[1:])
+    return np.moveaxis(np.concatenate([fine, a[-1:]]), 0, axis)
+
+
+def _quads(sheet: np.ndarray) -> np.ndarray:
+    """Quadrilaterals of a structured sheet (n, m, 4): (n_quads, 4, 4)."""
+    corners = [sheet[:-1, :-1], sheet[:-1, 1:], sheet[1:, 1:], sheet[1:, :-1]]
+    return np.stack(corners, axis=2).reshape(-1, 4, sheet.shape[-1])

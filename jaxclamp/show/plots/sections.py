@@ -1,0 +1,156 @@
+"""Deformed sections of artery and jaws at the states A to F."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.patches import PathPatch, Polygon
+from matplotlib.path import Path as Outline
+
+from jaxclamp.show.fields import jaw_height_shown, jaw_outline, layer_nodes
+from jaxclamp.show.plots.states import Clamped, shown_states
+from jaxclamp.show.plots.style import INK, JAW, JAW_EDGE, LARGE, SMALL, Picture, layer_colour, plain
+
+COLUMNS = 2
+WIDTH = 10.5
+"""inches"""
+MIRRORS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+
+
+def plot_sections(result: Clamped) -> Picture:
+    """Cross-section at mid-length and longitudinal section, whole artery with jaws, states A to F."""
+    states = shown_states(result)
+    model = result.model
+    wide, high = _largest(result)
+    jaw_half = float(result.scene.clamp.jaw.half_extent())
+    across, along = 1.12 * wide, max(1.15 * jaw_half + high, 1.8 * high)
+    along = min(along, 1.02 * float(np.max(np.asarray(result.closing[0].state.x)[:, 2])))
+    up = 1.25 * high
+    rows = -(-len(states) // COLUMNS)
+    columns = min(COLUMNS, len(states))
+    scale = 0.97 * WIDTH / (COLUMNS * 2.0 * (across + along))
+    figure = Picture(WIDTH * columns / COLUMNS + 0.2, rows * (2.0 * up * scale + 0.33) + 0.45)
+    gap = 0.12 * across  # between one state and the next
+    widths = [across, along, gap] * columns
+    grid = figure.add_gridspec(rows, len(widths) - 1, width_ratios=widths[:-1])
+    outline = jaw_outline(result.scene.clamp.jaw, 2.0 * up)
+    open_height = result.closing[0].values["outer_radius_mm"]
+    for place, (letter, index) in enumerate(states.items()):
+        kept, record = result.closing[index], result.history[index]
+        row, column = divmod(place, COLUMNS)
+        x = np.asarray(kept.state.x)
+        height = jaw_height_shown(model, kept.state, open_height)
+        left = figure.add_subplot(grid[row, 3 * column])
+        right = figure.add_subplot(grid[row, 3 * column + 1])
+        for side in (1, -1):
+            _bar(left, side * height, side * 2.0 * up, across)
+            right.add_patch(
+                Polygon(
+                    np.stack([outline[:, 0], side * (height + outline[:, 1])], axis=1),
+                    facecolor=JAW,
+                    edgecolor=JAW_EDGE,
+                    linewidth=0.9,
+                )
+            )
+        for number in range(len(result.scene.artery.layers)):
+            _cross_section(left, result, x, number)
+            _longitudinal_section(right, result, x, number)
+        _frame(left, across, up)
+        _frame(right, along, up)
+        left.set_title(letter, fontsize=LARGE, color=INK, loc="left", fontweight="bold")
+        said = f"travel {record['jaw_travel_mm']:.2f} mm, occlusion {record['occlusion']:.1%}"
+        right.set_title(said if place else "in the body", fontsize=SMALL, color=INK, loc="right")
+    _key(figure, result, figure.axes[1], up, along)
+    return figure
+
+
+def _largest(result: Clamped) -> tuple[float, float]:
+    """Largest half width and half height of the artery at mid-length over the closing, mm."""
+    mesh = result.model.mesh
+    outer = [mesh.node(-1, c, 0) for c in range(mesh.grid[1])]
+    x = np.stack([np.asarray(kept.state.x)[outer] for kept in result.closing])
+    return float(np.max(x[..., 0])), float(np.max(x[..., 1]))
+
+
+def _bar(axes: Axes, face: float, back: float, across: float) -> None:
+    """The jaw in the cross-section at mid-length."""
+    corners = [(-2 * across, face), (2 * across, face), (2 * across, back), (-2 * across, back)]
+    axes.add_patch(Polygon(corners, facecolor=JAW, edgecolor=JAW_EDGE, linewidth=0.9))
+
+
+def _plane_of_layer(result: Clamped, x: np.ndarray, layer: int) -> np.ndarray:
+    """Positions of a layer's nodes, (axial, circumferential, radial, 3)."""
+    grid = result.model.mesh.grid
+    return x[layer_nodes(result.model.mesh, layer)].reshape(grid[2], grid[1], -1, 3)
+
+
+def _cross_section(axes: Axes, result: Clamped, x: np.ndarray, layer: int) -> None:
+    points = _plane_of_layer(result, x, layer)[0, :, :, :2]
+    inner, outer = _ring(points[:, 0]), _ring(points[:, -1])
+    codes = [Outline.MOVETO, *[Outline.LINETO] * (len(inner) - 2), Outline.CLOSEPOLY]
+    path = Outline(np.concatenate([outer, inner[::-1]]), codes * 2)
+    fill, edge = layer_colour(layer)
+    axes.add_patch(PathPatch(path, facecolor=fill, edgecolor=edge, linewidth=0.8))
+    _element_lines(axes, points, edge)
+
+
+def _ring(quarter: np.ndarray) -> np.ndarray:
+    """A closed curve from its first quadrant, which runs from the x axis to the y axis."""
+    left = quarter[-2::-1] * [-1, 1]
+    upper = np.concatenate([quarter, left])
+    return np.concatenate([upper, upper[-2::-1] * [1, -1]])
+
+
+def _longitudinal_section(axes: Axes, result: Clamped, x: np.ndarray, layer: int) -> None:
+    points = _plane_of_layer(result, x, layer)[:, -1][..., [2, 1]]
+    fill, edge = layer_colour(layer)
+    inner, outer = points[:, 0], points[:, -1]
+    band = np.concatenate([inner[::-1] * [-1, 1], inner[1:], outer[::-1], outer[1:] * [-1, 1]])
+    for side in (1, -1):
+        axes.add_patch(Polygon(band * [1, side], facecolor=fill, edgecolor=edge, linewidth=0.8))
+    _element_lines(axes, points, edge)
+
+
+def _element_lines(axes: Axes, points: np.ndarray, colour: str) -> None:
+    """Lines between elements, faint, in all four quadrants; points: (along, through, 2)."""
+    mirrored = [points * sign for sign in np.array(MIRRORS)]
+    lines = [line for p in mirrored for line in (*p, *np.swapaxes(p, 0, 1))]
+    axes.add_collection(LineCollection(lines, colors=colour, linewidths=0.25, alpha=0.7))
+
+
+def _frame(axes: Axes, half_width: float, half_height: float) -> None:
+    axes.set_xlim(-half_width, half_width)
+    axes.set_ylim(-half_height, half_height)
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def _key(figure: Picture, result: Clamped, along: Axes, up: float, half_width: float) -> None:
+    """Names of layers and jaws, and a scale."""
+    names = [plain(layer.name) for layer in result.scene.artery.layers]
+    handles = [
+        Polygon([(0, 0)], facecolor=layer_colour(i)[0], edgecolor=layer_colour(i)[1], label=name)
+        for i, name in enumerate(names)
+    ]
+    handles.append(Polygon([(0, 0)], facecolor=JAW, edgecolor=JAW_EDGE, label="jaws"))
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=len(handles),
+        fontsize=SMALL,
+        frameon=False,
+        labelcolor=INK,
+    )
+    end, bar = 0.97 * half_width, _round_length(0.5 * half_width)
+    along.plot([end - bar, end], [0.0, 0.0], color=INK, linewidth=2.0, solid_capstyle="butt")
+    along.text(end - 0.5 * bar, 0.04 * up, f"{bar:g} mm", ha="center", va="bottom", fontsize=SMALL, color=INK)
+
+
+def _round_length(length: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not above a length, mm."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length))

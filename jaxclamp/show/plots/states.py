@@ -1,0 +1,58 @@
+"""What figures need of a result, and the states they pick from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from jaxclamp.potential.model import Model
+from jaxclamp.potential.tangent import State
+from jaxclamp.scenes.scene import Scene
+from jaxclamp.show.fields import spread
+from jaxclamp.show.plots.style import letters
+
+SHOWN = 6
+"""states A to F"""
+
+
+class KeptState(Protocol):
+    """One converged state."""
+
+    @property
+    def state(self) -> State: ...
+    @property
+    def values(self) -> dict[str, Any]: ...
+
+
+class Clamped(Protocol):
+    """A clamping's result, as far as figures are concerned."""
+
+    @property
+    def model(self) -> Model: ...
+    @property
+    def scene(self) -> Scene: ...
+    @property
+    def load_free(self) -> KeptState | None: ...
+    @property
+    def physiological(self) -> KeptState | None: ...
+    @property
+    def closing(self) -> Sequence[KeptState]: ...
+    @property
+    def history(self) -> list[dict[str, Any]]: ...
+    @property
+    def converged(self) -> bool: ...
+
+
+def shown_states(result: Clamped) -> dict[str, int]:
+    """Letter -> place in `closing`, from the body (A) to the last state, evenly spread over the travel."""
+    if not result.history:
+        raise ValueError("the artery in the body did not converge: there is no closing to draw")
+    places = spread([record["jaw_travel_mm"] for record in result.history], SHOWN)
+    return dict(zip(letters(len(places)), places, strict=True))
+
+
+def final_state(result: Clamped) -> KeptState:
+    """The last converged state from the physiological one on."""
+    if not result.closing:
+        raise ValueError("the artery in the body did not converge: there is no clamped state to draw")
+    return result.closing[-1]

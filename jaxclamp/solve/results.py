@@ -1,0 +1,277 @@
+"""What a clamping gives: its converged states, and the content of result.json."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import platform
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxclamp.core.failures import EquilibriumError
+from jaxclamp.observe.measures import Measure, Seen
+from jaxclamp.observe.stresses import PEAK_SHARPNESS
+from jaxclamp.potential.model import SYMMETRY, Model, terms
+from jaxclamp.potential.tangent import State
+from jaxclamp.scenes.scene import Scene
+from jaxclamp.solve.linear_solvers import LinearSolver
+from jaxclamp.solve.newton import Equilibrium
+
+if TYPE_CHECKING:
+    from jaxclamp.show.plots import Picture
+
+
+FINAL_KEYS = (
+    "jaw_travel_mm",
+    "lumen_height_mm",
+    "lumen_width_mm",
+    "occlusion",
+    "lumen_area_mm2",
+    "area_occlusion",
+    "clamp_force_N",
+    "max_contact_pressure_kPa",
+    "max_penetration_mm",
+    "axial_stress_at_P_kPa",
+    "axial_stress_ratio_at_P",
+    "circumferential_stress_ratio_at_P",
+    "peak_axial_stress_kPa",
+    "peak_axial_stress_location_mm",
+    "smooth_peak_axial_stress_kPa",
+    "J_min",
+    "J_max",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """One converged state and what was read off it."""
+
+    stage: str
+    equilibrium: Equilibrium
+    values: dict[str, Any]
+    """as in result.json: floats, and one dict per layer for peaks"""
+
+    @property
+    def state(self) -> State:
+        """Positions, pressures and jaw height."""
+        return self.equilibrium.state
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearSolvers:
+    """Solvers that hold the factors of a clamping: those of the last state, and room for the first's."""
+
+    stop: LinearSolver
+    physiological: LinearSolver
+    """unused until a derivative asks for it"""
+
+    def holding(self, values: np.ndarray) -> LinearSolver:
+        """A solver with the factors of the physiological tangent: one that has them, or after factoring."""
+        if self.stop.holds(values):
+            return self.stop
+        if not self.physiological.holds(values):
+            self.physiological.factor(values)
+        return self.physiological
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """Every converged state of a clamping."""
+
+    model: Model
+    states: tuple[Kept, ...]
+    """load-free, physiological, then closing, in order"""
+    failure: EquilibriumError | None
+    solver: dict[str, Any]
+    cost: dict[str, Any]
+    linear_solvers: LinearSolvers = dataclasses.field(repr=False)
+    errors: dict[str, dict[str, float | None]] | None = None
+    """how far the main figures may be off, see `jaxclamp.trust.estimates`; None if it was not asked for"""
+
+    def measure(self, measure: Measure) -> float:
+        """The value of a measure in internal units (mm, kPa, mN, uJ), from the states at hand.
+
+        Raises EquilibriumError if the stop was not reached, ValueError if it was not asked for.
+        """
+        self.require(measure.needs_stop)
+        return float(measure(self.seen))
+
+    def require(self, to_stop: bool) -> None:
+        """Raise EquilibriumError or ValueError unless there is something to measure or differentiate."""
+        if self.failure is not None:
+            raise self.failure
+        if to_stop and self.states[-1].stage != "clamping":
+            raise ValueError("this result is of the artery without its clamp: use jaxclamp.clamp")
+
+    @property
+    def seen(self) -> Seen:
+        """The body with its physiological state and, if it was closed, its last one."""
+        assert self.physiological is not None
+        last = self.states[-1]
+        return Seen(
+            body=self.model.body,
+            marks=self.model.marks,
+            physiological=self.physiological.state,
+            stop=last.state if last.stage == "clamping" else None,
+        )
+
+    @property
+    def scene(self) -> Scene:
+        return self.model.scene
+
+    @property
+    def converged(self) -> bool:
+        """True if the stop was reached."""
+        return self.failure is None
+
+    def _stage(self, stage: str) -> list[Kept]:
+        return [kept for kept in self.states if kept.stage == stage]
+
+    @property
+    def load_free(self) -> Kept | None:
+        return next(iter(self._stage("load-free")), None)
+
+    @property
+    def physiological(self) -> Kept | None:
+        return next(iter(self._stage("physiological")), None)
+
+    @property
+    def closing(self) -> list[Kept]:
+        """The physiological state and all states with the jaws on the artery."""
+        return self._stage("physiological") + self._stage("clamping")
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """One record per converged state from the physiological one on."""
+        return [self._relative(kept) for kept in self.closing]
+
+    @property
+    def final(self) -> dict[str, Any]:
+        """The record of the last converged state; None everywhere if it is not the artery in the body."""
+        return self.history[-1] if self.history else dict.fromkeys(FINAL_KEYS)
+
+    def _relative(self, kept: Kept) -> dict[str, Any]:
+        """A state's record, with the quantities that refer to the physiological state."""
+        assert self.physiological is not None
+        base, v = self.physiological.values, kept.values
+        travel = max(base["outer_radius_mm"] - v["jaw_height_mm"], 0.0) if kept.stage == "clamping" else 0.0
+        relative = {
+            "stage": kept.stage,
+            "jaw_travel_mm": travel,
+            "occlusion": 1.0 - v["lumen_height_mm"] / base["lumen_height_mm"],
+            "area_occlusion": 1.0 - v["lumen_area_mm2"] / base["lumen_area_mm2"],
+            "axial_stress_ratio_at_P": _ratio(v["axial_stress_at_P_kPa"], base["axial_stress_at_P_kPa"]),
+            "circumferential_stress_ratio_at_P": _ratio(
+                v["circumferential_stress_at_P_kPa"], base["circumferential_stress_at_P_kPa"]
+            ),
+            "negative_pivots": kept.equilibrium.negative_pivots,
+            "snapped": kept.equilibrium.snapped,
+            "newton_iterations": kept.equilibrium.iterations,
+        }
+        return relative | {key: value for key, value in v.items() if key != "jaw_height_mm"}
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of result.json."""
+        scene = self.scene
+        load_free, base = self.load_free, self.physiological
+        return {
+            "title": scene.title,
+            "converged": self.converged,
+            "failure": None if self.failure is None else str(self.failure),
+            "load_free": {
+                "lumen_radius_mm": _radius(load_free),
+                "outer_radius_mm": load_free and load_free.values["outer_radius_mm"],
+            },
+            "physiological": {
+                "lumen_radius_mm": _radius(base),
+                "outer_radius_mm": base and base.values["outer_radius_mm"],
+                "axial_stress_at_P_kPa": base and base.values["axial_stress_at_P_kPa"],
+                "circumferential_stress_at_P_kPa": base and base.values["circumferential_stress_at_P_kPa"],
+            },
+            "final": self.final,
+            "errors": self.errors,
+            "history": self.history,
+            "model": {
+                "symmetry": SYMMETRY,
+                "elements": self.model.mesh.n_cells,
+                "element": scene.mesh.element,
+                "unknowns": self.model.pattern.n,
+                "terms": terms(scene),
+                "peak_sharpness": PEAK_SHARPNESS,
+            },
+            "solver": self.solver,
+            "cost": self.cost,
+            "versions": versions(),
+        }
+
+    # --- figures: matplotlib is imported when one is drawn ------------------------------------------
+
+    def plot_wall_stress(self) -> Picture:
+        """Circumferential and axial stress through the wall, load-free and in the body."""
+        from jaxclamp.show import plots
+
+        return plots.plot_wall_stress(self)
+
+    def plot_sections(self) -> Picture:
+        """Deformed cross-sections and longitudinal sections with the jaws, states A to F."""
+        from jaxclamp.show import plots
+
+        return plots.plot_sections(self)
+
+    def plot_stress_at_P(self) -> Picture:
+        """Normalised axial and circumferential stress at P against jaw travel."""
+        from jaxclamp.show import plots
+
+        return plots.plot_stress_at_P(self)
+
+    def plot_axial_stress_maps(self) -> Picture:
+        """Axial stress of every layer in the last state."""
+        from jaxclamp.show import plots
+
+        return plots.plot_axial_stress_maps(self)
+
+    def plot_force_travel(self) -> Picture:
+        """Jaw force and occlusion against jaw travel."""
+        from jaxclamp.show import plots
+
+        return plots.plot_force_travel(self)
+
+
+def _radius(kept: Kept | None) -> float | None:
+    return None if kept is None else 0.5 * kept.values["lumen_height_mm"]
+
+
+def _ratio(value: float, base: float) -> float | None:
+    return value / base if base != 0.0 else None
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    names = ("jaxclamp", "jax", "jaxlib", "numpy", "scipy")
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def work_balance(closing: list[Kept]) -> float | None:
+    """Work of the jaws against the change of total energy over the closing, relative.
+
+    Between two states the force is integrated over the travel with its slopes at both ends
+    (Hermite, fourth order): W = h/2 (F0 + F1) + h**2/12 (F0' - F1').
+    """
+    if len(closing) < 3:
+        return None
+    work = 0.0
+    for a, b in pairwise(closing):
+        down = float(a.state.jaw_height) - float(b.state.jaw_height)
+        forces = [float(k.equilibrium.lin.jaw_force) for k in (a, b)]
+        slopes = [-k.equilibrium.force_slope for k in (a, b)]
+        work += down / 2.0 * sum(forces) + down**2 / 12.0 * (slopes[0] - slopes[1])
+    change = float(closing[-1].equilibrium.lin.energy) - float(closing[0].equilibrium.lin.energy)
+    return abs(work - change) / max(abs(change), 1e-12)

@@ -1,0 +1,66 @@
+"""States of one mesh carried over to another mesh of the same artery, to start Newton's method from."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import Akima1DInterpolator
+
+from jaxclamp.fem.tube import angles, axial_fractions
+from jaxclamp.potential.model import Model
+from jaxclamp.potential.tangent import State
+
+
+def transferred(state: State, old: Model, new: Model) -> State:
+    """A state of the old model on the mesh of the new one; both have the same layers.
+
+    Positions are interpolated with splines (Akima's, which do not ring where the wall leaves the
+    jaw) along and around the artery, so that the wall stays as smooth under the jaw as it was, and
+    linearly through each layer. Pressures are interpolated linearly between the middles of the cells;
+    they must come from the old state: those that would fit the interpolated volumes are wrong by the
+    bulk modulus times the error of the interpolation.
+    """
+    positions = np.asarray(state.x).reshape(*old.mesh.grid[::-1], 3)
+    for axis, (known, wanted) in enumerate(zip(_lines(old), _lines(new), strict=True)):
+        positions = (_linear if axis == RADIAL else _smooth)(positions, known, wanted, axis)
+    modes = np.zeros((len(new.body.stencils.modes), new.mesh.n_cells))
+    for layer, (first, last) in enumerate(new.mesh.layer_cells):
+        start, end = old.mesh.layer_cells[layer]
+        middles = _middles(old, layer)
+        means = np.asarray(state.p[0, start:end]).reshape([len(line) for line in middles])
+        for axis, (known, wanted) in enumerate(zip(middles, _middles(new, layer), strict=True)):
+            means = _linear(means, known, wanted, axis)
+        modes[0, first:last] = means.ravel()
+    return State(x=jnp.asarray(positions.reshape(-1, 3)), p=jnp.asarray(modes), jaw_height=state.jaw_height)
+
+
+RADIAL = 2
+
+
+def _lines(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Place of each axial, circumferential and radial grid line in the artery: the same on every mesh."""
+    mesh, settings = model.mesh, model.scene.mesh
+    return (
+        np.asarray(axial_fractions(mesh, settings)),
+        np.asarray(angles(mesh, settings)),
+        mesh.node_layer + mesh.node_fraction,
+    )
+
+
+def _middles(model: Model, layer: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Place of the middles of a layer's cells along each axis."""
+    axial, circumferential, _ = (line[:: model.mesh.element.order] for line in _lines(model))
+    count = model.scene.mesh.radial[layer]
+    between = lambda line: 0.5 * (line[1:] + line[:-1])  # noqa: E731
+    return between(axial), between(circumferential), (np.arange(count) + 0.5) / count
+
+
+def _smooth(values: np.ndarray, known: np.ndarray, wanted: np.ndarray, axis: int) -> np.ndarray:
+    # the last lines of two gradings may differ by rounding, and Akima's splines end with the known ones
+    inside = np.clip(wanted, known[0], known[-1])
+    return np.asarray(Akima1DInterpolator(known, values, axis=axis)(inside))
+
+
+def _linear(values: np.ndarray, known: np.ndarray, wanted: np.ndarray, axis: int) -> np.ndarray:
+    """Linear between the known places, constant beyond them."""
+    return np.apply_along_axis(lambda line: np.interp(wanted, known, line), axis, values)

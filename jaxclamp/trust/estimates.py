@@ -1,0 +1,150 @@
+"""How far the figures of a result may be off numerically, and where that comes from.
+
+Four sources, each an estimate of (figure - exact figure), in the figure's unit:
+
+- discretisation: the difference to a coarser twin of the scene, extrapolated with the element's order;
+- bulk: the wall is not quite incompressible. With figure = exact + a / bulk, what is missing is the
+  figure's derivative by log(bulk), at the solution: one linear solve, no iteration;
+- contact stiffness: the jaws sink into the wall a little; as for the bulk modulus;
+- contact smoothing: the jaws touch before they touch; with figure = exact + a smoothing.
+
+The error of a figure is the sum of their sizes. It says nothing of the model: of constants, of symmetry.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxclamp.core.failures import EquilibriumError, Singular
+from jaxclamp.scenes.scene import MeshSettings, Scene, replace
+from jaxclamp.solve.clamping import clamp, inflate, predicted
+from jaxclamp.solve.results import Result
+
+FINAL = (
+    "jaw_travel_mm",
+    "lumen_height_mm",
+    "lumen_width_mm",
+    "lumen_area_mm2",
+    "clamp_force_N",
+    "axial_stress_at_P_kPa",
+    "smooth_peak_axial_stress_kPa",
+    "peak_axial_stress_kPa",
+)
+"""figures of the last state that an error is given for; those of layers have one each"""
+
+CHANGE = 1e-3
+"""relative change of a penalty for its derivative"""
+COARSENINGS = (1.3, 2.0)
+"""elements of the scene over elements of its twin, per direction"""
+ORDER, ORDER_AT_A_POINT = 2.0, 1.0
+"""with which figures converge as the mesh is refined; stress at a point, such as P or where it peaks, has
+the cell's constant pressure in it, and the place of a peak wanders from point to point"""
+SOURCES = ("discretisation", "bulk", "contact_stiffness", "contact_smoothing")
+
+Errors = dict[str, dict[str, float | None]]
+
+
+def figures(result: Result) -> dict[str, float]:
+    """The main figures of a result by key: of the body, then of the last state, KEY.LAYER for layers."""
+    assert result.physiological is not None
+    body = result.physiological.values
+    found = {
+        "physiological.lumen_radius_mm": 0.5 * body["lumen_height_mm"],
+        "physiological.axial_stress_at_P_kPa": body["axial_stress_at_P_kPa"],
+    }
+    if result.states[-1].stage == "clamping":
+        for key in FINAL:
+            value = result.final[key]
+            parts = value.items() if isinstance(value, dict) else [("", value)]
+            found |= {f"{key}.{layer}" if layer else key: float(part) for layer, part in parts}
+    return found
+
+
+def coarser(mesh: MeshSettings) -> tuple[MeshSettings, float]:
+    """A mesh coarsened as evenly in all directions as whole numbers allow, and by how much per direction."""
+    counts = np.array([mesh.circumferential, mesh.axial, *mesh.radial], float)
+    least = np.array([2, 2, *[1] * len(mesh.radial)])
+
+    def unevenness(factor: float) -> float:
+        return float(np.ptp(np.log(counts / np.maximum(np.round(counts / factor), least))))
+
+    factor = min(np.linspace(*COARSENINGS, 71), key=unevenness)
+    fewer = np.maximum(np.round(counts / factor), least).astype(int).tolist()
+    coarse = dataclasses.replace(mesh, circumferential=fewer[0], axial=fewer[1], radial=tuple(fewer[2:]))
+    cells = [m.circumferential * m.axial * sum(m.radial) for m in (mesh, coarse)]
+    return coarse, (cells[0] / cells[1]) ** (1.0 / 3.0)
+
+
+def estimate(result: Result) -> Errors:
+    """Errors by figure: `value`, `error` (None if it is not known) and the four signed sources."""
+    values = figures(result)
+    sources = {
+        "discretisation": _from_the_mesh(result, values),
+        "bulk": _from_a_penalty(result, values, bulk_paths(result.scene), -1.0),
+        "contact_stiffness": _from_a_penalty(result, values, ("contact.stiffness",), -1.0),
+        "contact_smoothing": _from_a_penalty(result, values, ("contact.smoothing",), 1.0),
+    }
+    return {
+        key: {"value": value, "error": _total([part[key] for part in sources.values()])}
+        | {name: part[key] for name, part in sources.items()}
+        for key, value in values.items()
+    }
+
+
+def with_errors(result: Result) -> Result:
+    """The result with its errors estimated: some iterations on a coarser twin, a few linear solves."""
+    return dataclasses.replace(result, errors=estimate(result))
+
+
+def bulk_paths(scene: Scene) -> tuple[str, ...]:
+    """Paths of the layers' bulk moduli."""
+    return tuple(f"artery.layers[{i}].material.bulk" for i in range(len(scene.artery.layers)))
+
+
+def _total(parts: list[float | None]) -> float | None:
+    known = [abs(part) for part in parts if part is not None]
+    return sum(known) if len(known) == len(parts) else None
+
+
+def _from_the_mesh(result: Result, values: dict[str, float]) -> dict[str, float | None]:
+    """Figure less the figure on an infinitely fine mesh; None where the twin has no equilibrium."""
+    mesh, ratio = coarser(result.scene.mesh)
+    scene = dataclasses.replace(result.scene, mesh=mesh)
+    solve: Callable[..., Result] = clamp if result.states[-1].stage == "clamping" else inflate
+    try:
+        twin = figures(solve(scene, guess=result))
+    except EquilibriumError:
+        return dict.fromkeys(values)
+    order = lambda key: ORDER_AT_A_POINT if "_stress_" in key else ORDER  # noqa: E731
+    return {key: (value - twin[key]) / (1.0 - ratio ** order(key)) for key, value in values.items()}
+
+
+def _from_a_penalty(
+    result: Result, values: dict[str, float], paths: tuple[str, ...], sign: float
+) -> dict[str, float | None]:
+    """Sign times the derivative of each figure by the logarithm of a penalty's constants; None if refused."""
+    scene = multiplied(result.scene, paths, 1.0 + CHANGE)
+    try:
+        near = figures(predicted(result, scene))
+    except (
+        EquilibriumError,
+        Singular,
+    ):  # the result stays, its error is not known
+        return dict.fromkeys(values)
+    slopes = {key: sign * (near[key] - value) / CHANGE for key, value in values.items()}
+    return {key: slope if math.isfinite(slope) else None for key, slope in slopes.items()}
+
+
+def multiplied(scene: Scene, paths: tuple[str, ...], factor: float) -> Scene:
+    """A scene with the penalties at some paths (of layers' bulk moduli, of contact) multiplied."""
+    for path in paths:
+        owner: Any = scene.contact
+        if path.startswith("artery"):
+            owner = scene.artery.layers[int(path.split("[")[1].split("]")[0])].material
+        scene = replace(scene, path, factor * float(getattr(owner, path.rpartition(".")[2])))
+    return scene
