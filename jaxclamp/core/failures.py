@@ -14,6 +14,7 @@ class Failure(Exception):
     """What went wrong, in one sentence."""
 
     exit_code = 1
+    """what the command line answers with"""
 
 
 class SceneError(Failure):
@@ -28,12 +29,20 @@ class BadKey(Failure):
     exit_code = 2
 
 
+class BadAddress(SceneError, KeyError):
+    """One sentence on an address that leads nowhere in a scene; a KeyError too, as for any missing name."""
+
+    def __str__(self) -> str:  # KeyError's would put the sentence in quotes
+        return str(self.args[0])
+
+
 class NotConverged(Failure):
     """One attempt at an equilibrium failed; the caller cuts its step or changes its method."""
 
     exit_code = 3
 
     def __init__(self, reason: str, residual: float = math.nan, J_min: float = math.nan) -> None:
+        """reason: in words; residual: norm of the forces left, mN; J_min: smallest volume ratio."""
         super().__init__(reason, residual, J_min)
         self.reason, self.residual, self.J_min = reason, residual, J_min
 
@@ -54,6 +63,7 @@ class EquilibriumError(Failure):
     exit_code = 3
 
     def __init__(self, stage: str, load: str, failure: NotConverged, advice: str) -> None:
+        """stage and load: where it failed; failure: how; advice: what to try."""
         super().__init__(stage, load, failure, advice)
         self.stage, self.load, self.failure, self.advice = stage, load, failure, advice
         self.residual, self.J_min = failure.residual, failure.J_min

@@ -13,9 +13,11 @@ class Progress:
     """Where a piece of work stands."""
 
     stage: str
+    """what is being done, such as clamping"""
     fraction: float
     """of the stage, 0 to 1"""
     message: str
+    """what was reached, for people"""
 
 
 Tell = Callable[[Progress], Any]

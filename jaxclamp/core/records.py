@@ -8,7 +8,8 @@ A field is one of three things:
 * another record.
 
 Records hold no behaviour at construction: they are rebuilt by JAX with tracers inside, so checks
-live in `jaxclamp.scenes.scene`.
+live in `jaxclamp.scenes.checks`. Two records of one class are equal if all their values are, arrays
+item by item.
 """
 
 from __future__ import annotations
@@ -19,19 +20,21 @@ from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 
 Array = jax.Array
 Record = TypeVar("Record")
 
-# Internal units are mm, kPa, mN and radians: factor from the unit of the scene file.
 UNIT_FACTOR = {
     "": 1.0,
     "mm": 1.0,
+    "mm2": 1.0,
     "kPa": 1.0,
     "kPa_per_mm": 1.0,
     "deg": math.pi / 180.0,
     "N": 1e3,
 }
+"""internal units (mm, kPa, mN, radians) in one unit of a scene file"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,9 +42,13 @@ class Range:
     """Unit and sensible interval of a quantity, in the unit of the scene file."""
 
     unit: str
+    """a key of `UNIT_FACTOR`"""
     lower: float
+    """least value, in that unit"""
     upper: float
+    """greatest value, in that unit"""
     open_lower: bool = False
+    """True if `lower` itself is outside"""
 
     def contains(self, value: float) -> bool:
         """True if `value` (in the file's unit) is finite and inside the interval."""
@@ -63,26 +70,66 @@ def quantity(
     many: bool = False,
     default: Any = dataclasses.MISSING,
 ) -> Any:
-    """A differentiable float (`many`: an array of floats) with its file unit and its range."""
+    """A differentiable float (`many`: an array of floats, (n,)) with its file unit and its range.
+
+    Raises ValueError for a unit that is not in `UNIT_FACTOR`.
+    """
+    if unit not in UNIT_FACTOR:
+        raise ValueError(f"unit {unit!r}: expected one of {', '.join(repr(u) for u in UNIT_FACTOR)}")
     metadata = {"range": Range(unit, lower, upper, open_lower), "many": many}
     return dataclasses.field(metadata=metadata, default=default)
 
 
 def static(default: Any = dataclasses.MISSING, choices: tuple[str, ...] = ()) -> Any:
-    """A choice that is part of the compiled program (hashable)."""
+    """A choice that is part of the compiled program (hashable).
+
+    With a default and no `choices` a string is the tag of its class, such as a law's name.
+    """
     metadata = {"static": True, "choices": choices}
     return dataclasses.field(metadata=metadata, default=default)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(quantity, static))
 def record(cls: type[Record]) -> type[Record]:
-    """Make `cls` a frozen, keyword-only dataclass and a JAX pytree."""
-    frozen: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    """Make `cls` a frozen, keyword-only dataclass and a JAX pytree, with `==` that gives a bool."""
+    frozen: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
+    frozen.__eq__, frozen.__hash__ = _equal, _hash
     fields = dataclasses.fields(frozen)
     meta = [f.name for f in fields if f.metadata.get("static")]
     data = [f.name for f in fields if not f.metadata.get("static")]
     jax.tree_util.register_dataclass(frozen, data_fields=data, meta_fields=meta)
     return frozen
+
+
+def _equal(self: Any, other: Any) -> Any:
+    """True if both are of one class and hold the same values, arrays of the same shape item by item."""
+    if type(self) is not type(other):
+        return NotImplemented
+    if self is other:
+        return True
+    for field in dataclasses.fields(self):
+        a, b = getattr(self, field.name), getattr(other, field.name)
+        if not (a == b if field.metadata.get("static") else _same(a, b)):
+            return False
+    return True
+
+
+def _same(a: Any, b: Any) -> bool:
+    """True if two pytrees have the same structure and the same leaves.
+
+    The values of two tracers are not known: JAX raises its own error for them, since either answer might
+    be wrong. (`np.array_equal` alone would swallow it and say False.)
+    """
+    leaves, others = jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b)
+    structures: list[Any] = [jax.tree_util.tree_structure(tree) for tree in (a, b)]
+    return bool(structures[0] == structures[1]) and all(
+        x is y or np.array_equal(np.asarray(x), np.asarray(y)) for x, y in zip(leaves, others, strict=True)
+    )
+
+
+def _hash(self: Any) -> int:
+    """Of the values; TypeError where one is an array. Values that are equal and have one have the same."""
+    return hash((type(self), *(getattr(self, f.name) for f in dataclasses.fields(self))))
 
 
 def concrete_subclasses(base: type) -> list[type]:
@@ -92,6 +139,9 @@ def concrete_subclasses(base: type) -> list[type]:
 
 
 def shape_of(tree: Any, describe: Callable[[Any], Any] = lambda leaf: getattr(leaf, "shape", ())) -> Any:
-    """The static skeleton of a record: its tree structure and the shape of each leaf."""
+    """The static skeleton of a record: its tree structure and what `describe` says of each leaf.
+
+    By default that is the leaf's shape, () for a float.
+    """
     leaves, structure = jax.tree_util.tree_flatten(tree)
     return structure, tuple(describe(leaf) for leaf in leaves)

@@ -25,7 +25,7 @@ LARGEST_EXPONENT = 680.0
 
 
 def components(A: Array) -> dict[tuple[int, int], Array]:
-    """The components of A (n, m, *batch) as arrays of their own.
+    """The components of A (n, m, *batch) as arrays of their own, each (*batch).
 
     Differentiated backwards, this joins nine arrays; indexing A would add up nine arrays that are
     zero in eight of nine places, each computed anew: ten times slower.
@@ -82,7 +82,10 @@ def inverse(A: Tensor) -> Array:
 
 
 def largest_eigenvalue(A: Tensor) -> Array:
-    """Largest eigenvalue of a symmetric A: m + 2 q cos(arccos(r) / 3), Smith, Commun ACM 4 (1961) 168."""
+    """Largest eigenvalue of a symmetric A, (*batch): m + 2 q cos(arccos(r) / 3).
+
+    Smith, Commun ACM 4 (1961) 168.
+    """
     m = (A[0, 0] + A[1, 1] + A[2, 2]) / 3.0
     B = {(i, j): A[i, j] - m if i == j else A[i, j] for i in range(3) for j in range(3)}
     q = safe_sqrt(squared_norm(B) / 6.0)
@@ -145,6 +148,8 @@ def smooth_maximum(values: Array, weights: Array, sharpness: float) -> Array:
 
     It tends to the maximum from below as the sharpness s grows and, weighted by volume, does not
     depend on how finely the volume is cut. Zero where nothing is positive.
+
+    values, weights: of the same shape, any; the maximum, a scalar, is in the unit of the values.
     """
     positive = jnp.maximum(values, 0.0)
     scale = lax.stop_gradient(jnp.max(positive))
