@@ -29,8 +29,9 @@ from jaxclamp.observe.measures import (  # noqa: E402
     stored_energy,
     volume_above,
 )
+from jaxclamp.scenes.address import replace  # noqa: E402
 from jaxclamp.scenes.files import dump_scene, load_scene  # noqa: E402
-from jaxclamp.scenes.scene import Scene, replace  # noqa: E402
+from jaxclamp.scenes.scene import Scene  # noqa: E402
 from jaxclamp.sensitivity.adjoint import value_and_gradient  # noqa: E402
 from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
 from jaxclamp.solve.clamping import Result, clamp  # noqa: E402

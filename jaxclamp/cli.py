@@ -260,7 +260,8 @@ def presets(
 
 
 def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:
-    from jaxclamp.scenes.files import EXPECTED_ERRORS, load_scene, own_mesh_keys
+    from jaxclamp.scenes.fidelity import EXPECTED_ERRORS
+    from jaxclamp.scenes.files import load_scene, own_mesh_keys
 
     loaded = load_scene(scene, overrides or (), fidelity or "standard")
     if fidelity is None or quiet:

@@ -14,7 +14,7 @@ import pytest
 
 from jaxclamp.cli import main
 from jaxclamp.core.failures import EquilibriumError, NotConverged
-from jaxclamp.scenes.files import mesh_for
+from jaxclamp.scenes.fidelity import mesh_for
 from jaxclamp.scenes.presets import presets
 
 FIGURES = {

@@ -1,23 +1,36 @@
 """Scene files: what is read is what was written, and what is wrong is refused in one sentence."""
 
 import abc
+import ast
 import copy
 import dataclasses
 import math
 import tomllib
+from itertools import zip_longest
+from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxclamp.core.failures import SceneError
-from jaxclamp.core.records import quantity, record, static
+from jaxclamp.core.records import concrete_subclasses, quantity, record, static
 from jaxclamp.fem.tube import build_mesh, closed_radii
 from jaxclamp.scenes import schema
-from jaxclamp.scenes.files import dump_scene, load_scene, loads_scene, own_mesh_keys
+from jaxclamp.scenes.address import replace
+from jaxclamp.scenes.files import (
+    dump_scene,
+    load_scene,
+    loads_scene,
+    own_mesh_keys,
+    require_computable,
+    require_possible,
+)
 from jaxclamp.scenes.presets import presets
+from jaxclamp.scenes.scene import OcclusionStop, SolverSettings, Stop, TravelStop
 
 HGO = {"law": "hgo", "c_kPa": 27.0, "k1_kPa": 0.64, "k2": 3.54, "fibre_angle_deg": 10.0, "bulk_kPa": 1e4}
 CHOICES = {"fibre_energy": "eq10", "fibre_invariant": "full"}
@@ -64,6 +77,7 @@ def scene_table(jaw, stop, first=HGO, second=HGO):
             "circumferential_grading": 0.5,
             "element": "q1p0",
             "contact_points": 4,
+            "symmetry": "xz",
         },
         "solver": {"tolerance": 1e-9, "continuation": "travel", "linear_solver": "splu"},
     }
@@ -302,6 +316,28 @@ def test_a_forgotten_unit_is_suggested():
     assert "did you mean c_kPa?" in sentence
 
 
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        (
+            ("artery", "pressure_mmHg"),
+            "artery.pressure_mmHg; did you mean pressure_kPa? (1 mmHg = 0.133322 kPa)",
+        ),
+        (("artery", "layers", 1, "thickness_um"), "did you mean thickness_mm? (1 um = 0.001 mm)"),
+        (("artery", "layers", 0, "material", "c_MPa"), "did you mean c_kPa? (1 MPa = 1000 kPa)"),
+        (("stop", "force_mN"), "did you mean force_N? (1 mN = 0.001 N)"),
+    ],
+)
+def test_a_wrong_unit_is_refused_with_the_right_one(path, words):
+    assert words in refusal(with_value(TABLES["flat, goh, travel"], path, 3.0))
+
+
+@pytest.mark.parametrize("key", ["x" * 100_000, "x\ny" * 1000, "artery." * 5000])
+def test_long_keys_are_cut(key):
+    for path in ((key,), ("artery", key), ("artery", "layers", 0, "material", key), ("stop", key)):
+        assert len(refusal(with_value(TABLES["flat, goh, travel"], path, 3.0))) < 300
+
+
 @pytest.mark.parametrize("leaf", LEAVES)
 def test_missing_keys_are_named_or_have_defaults(leaf):
     table, path, _ = LEAVES[leaf]
@@ -342,6 +378,44 @@ def test_a_stop_is_exactly_one():
     both = scene_table(FLAT, {"occlusion": 0.9, "force_N": 1.0})
     assert "expected exactly one of occlusion, travel_mm, force_N" in refusal(both)
     assert "not available yet; use an occlusion" in refusal(scene_table(FLAT, {"closed": True}))
+
+
+@record
+class AreaStop(Stop):
+    """A stop of a user's own."""
+
+    kind: str = static("area")
+    area: jax.Array = quantity("mm2", 0.0, 1e3, open_lower=True)
+
+    def measure(self, equilibria): ...
+
+
+def test_a_stop_of_ones_own_needs_no_registration():
+    assert concrete_subclasses(Stop)[-1] is AreaStop
+    scene = loads(scene_table(FLAT, {"area_mm2": 2}))
+    assert isinstance(scene.stop, AreaStop)
+    assert scene.stop == AreaStop(area=2.0)
+    text = dump_scene(scene)
+    assert "[stop]\narea_mm2 = 2.0\n\n" in text
+    assert same(loads_scene(text), scene)
+    assert load_scene("human-lad", ["stop.area_mm2=3"]).stop == AreaStop(area=3.0)
+    assert load_scene("human-lad", ["stop.area_mm2=3", "stop.travel_mm=1"]).stop == TravelStop(travel=1.0)
+    assert "stop.area_mm2 = 0.0: expected a number greater than 0 mm2" in refusal(
+        scene_table(FLAT, {"area_mm2": 0.0})
+    )
+    both = scene_table(FLAT, {"area_mm2": 1.0, "force_N": 1.0})
+    assert "expected exactly one of occlusion, travel_mm, force_N, area_mm2" in refusal(both)
+
+
+def test_an_unknown_stop_is_refused_with_those_there_are():
+    sentence = refusal(scene_table(FLAT, {"zzz": 1.0}))
+    assert "unknown key stop.zzz; known here: occlusion, travel_mm, force_N, area_mm2" in sentence
+    assert "unknown key stop.kind" in refusal(scene_table(FLAT, {"kind": "area", "area_mm2": 1.0}))
+
+
+def test_a_quantity_has_a_unit_that_is_known():
+    with pytest.raises(ValueError, match="unit 'furlong': expected one of"):
+        quantity("furlong", 0.0, 1.0)
 
 
 def test_equal_jaws_are_one_and_different_ones_are_refused():
@@ -643,7 +717,136 @@ def test_angles_set_in_python_are_written_to_the_last_digit(angle):
     assert written == pytest.approx(angle, rel=4e-16, abs=0)
 
 
+# ------------------------------------------------------------------------------------- equal scenes
+
+
+def test_scenes_compare_by_value_also_with_arrays():
+    spline = loads(TABLES["spline, neo, force"])
+    again = loads(TABLES["spline, neo, force"])
+    assert (spline == again) is True
+    assert (spline != again) is False
+    assert (spline == replace(again, "clamp.jaw.slopes", jnp.asarray(again.clamp.jaw.slopes))) is True
+    for address, value in [
+        ("clamp.jaw.slopes[1]", 0.21),
+        ("clamp.jaw.slopes", np.array([0.1, 0.2, 0.3])),
+        ("clamp.jaw.slopes", 0.1),
+        ("artery.pressure", 13.34),
+        ("artery.layers[1].name", "outer"),
+        ("artery.layers", spline.artery.layers[:1]),
+        ("mesh.radial[0]", 6),
+        ("stop", OcclusionStop(occlusion=0.5)),
+        ("artery.layers[0].material.c", np.full((3, 4), 2.7)),
+    ]:
+        changed = replace(spline, address, value)
+        assert (changed == spline) is False, address
+        assert (changed == replace(again, address, value)) is True, address
+    assert spline != "spline"
+    assert OcclusionStop(occlusion=0.5) != TravelStop(travel=0.5)
+
+
+def test_records_without_arrays_can_be_hashed_and_equal_ones_alike():
+    one, other = load_scene("human-lad"), load_scene("human-lad")
+    assert hash(one) == hash(other)
+    assert hash(one) != hash(load_scene("mouse-aorta"))
+    assert len({SolverSettings(), SolverSettings(tolerance=1e-8), SolverSettings(tolerance=1e-9)}) == 2
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(loads(TABLES["spline, neo, force"]))
+
+
+def test_traced_records_equal_themselves_and_are_not_guessed_at():
+    """A record is itself; whether two traced values are the same is for JAX to refuse."""
+
+    @jax.jit
+    def traced(scene, other):
+        assert scene == scene
+        assert scene == replace(scene, "title", scene.title)
+        with pytest.raises(jax.errors.TracerArrayConversionError):
+            assert scene == other
+        return scene.artery.pressure
+
+    scene = jax.tree_util.tree_map(jnp.asarray, load_scene("human-lad"))
+    assert float(traced(scene, scene)) == 13.33
+
+
+# ------------------------------------------------------------------------------------- made in Python
+
+
+def per_point(value=27.0, shape=(8, 150)):
+    """A scene whose media has a constant for each point."""
+    return replace(load_scene("human-lad"), "artery.layers[0].material.c", jnp.full(shape, value))
+
+
+def test_constants_per_point_are_computable_and_cannot_be_written():
+    require_computable(per_point())
+    for refused in (dump_scene, require_possible):
+        with pytest.raises(SceneError) as caught:
+            refused(per_point())
+        assert str(caught.value) == (
+            "scene: artery.layers[0].material.c_kPa is an array of shape (8, 150): "
+            "a scene file holds one number there"
+        )
+
+
+def test_one_constant_that_is_not_finite_is_found():
+    scene = per_point()
+    wrong = replace(scene, "artery.layers[0].material.c[3][14]", math.nan)
+    with pytest.raises(SceneError, match=r"artery\.layers\[0\]\.material\.c_kPa\[3\]\[14\] = nan: expected"):
+        require_computable(wrong)
+    thin = replace(scene, "artery.layers[1].thickness", np.full((1, 2), 0.0))
+    with pytest.raises(SceneError, match=r"layers\[1\]\.thickness_mm\[0\]\[0\] = 0\.0: expected"):
+        require_computable(thin)
+    require_computable(replace(scene, "artery.layers[0].material.k1", np.zeros((8, 150))))
+
+
+def test_slopes_that_are_one_number_cannot_be_written():
+    scene = replace(loads(TABLES["spline, neo, force"]), "clamp.jaw.slopes", 0.1)
+    with pytest.raises(SceneError, match=r"slopes is an array of shape \(\): a scene file holds a list"):
+        dump_scene(scene)
+
+
 # ------------------------------------------------------------------------------------- the schema
+
+
+@pytest.mark.parametrize("choice", ["auto", "xyz", "xy", "xz", "yz", "x", "y", "z", "none"])
+def test_symmetry_is_a_choice_of_the_mesh(choice):
+    scene = load_scene("human-lad", [f"mesh.symmetry={choice}"])
+    assert scene.mesh.symmetry == choice
+    assert same(loads_scene(dump_scene(scene)), scene)
+
+
+def undocumented(path):
+    """Public functions, classes and fields of a module that say nothing about themselves."""
+
+    def of(body, prefix, fields):
+        for node, following in zip_longest(body, body[1:]):
+            name = getattr(node, "name", None)
+            if isinstance(node, ast.AnnAssign) and fields:
+                name = node.target.id
+                said = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
+                said = said or _is_tag(node)
+            elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+                said = ast.get_docstring(node) is not None
+            else:
+                continue
+            if not name.startswith("_") and not said:
+                yield f"{prefix}{name}"
+            if isinstance(node, ast.ClassDef) and not name.startswith("_"):
+                yield from of(node.body, f"{prefix}{name}.", True)
+
+    return list(of(ast.parse(path.read_text(encoding="utf-8")).body, f"{path.stem}.", False))
+
+
+def _is_tag(node):
+    """A record's own name, or a constant of its class, explained where its base is."""
+    return ast.unparse(node.annotation).startswith("ClassVar") or ast.unparse(node).startswith("kind: str = ")
+
+
+@pytest.mark.parametrize("room", ["core", "scenes", "scenes/presets"])
+def test_everything_public_says_what_it_is(room):
+    folder = Path(schema.__file__).parents[1] / room
+    modules = sorted(folder.glob("*.py"))
+    assert modules
+    assert [name for path in modules for name in undocumented(path)] == []
 
 
 class Tool(abc.ABC):

@@ -12,21 +12,25 @@ from typing import Any
 import numpy as np
 
 from jaxclamp.core.failures import BadKey
-from jaxclamp.core.records import UNIT_FACTOR
+from jaxclamp.core.records import UNIT_FACTOR, Range
 from jaxclamp.physics.jaws import Spline
 from jaxclamp.scenes import schema
-from jaxclamp.scenes.scene import Layer, Scene, TravelStop
+from jaxclamp.scenes.scene import Layer, Scene
 from jaxclamp.scenes.schema import refuse
 
 MOST_CELLS = 200_000
+"""elements of a mesh"""
 COUNTS = {"circumferential": (2, 400), "axial": (2, 400), "contact_points": (1, 20)}
+"""least and most of each count"""
 RADIAL_COUNTS = (1, 100)
+"""least and most elements through a layer"""
 TOLERANCES = (1e-13, 1e-2)
+"""least and greatest tolerance of equilibrium"""
 
 CLOSING_STRETCHES = (0.5, 2.0)
 """circumferential stretch with which a layer may close round the one inside"""
 TRAVELS = (0.0, 3.0)
-"""a jaw's travel over the widest outer radius: the jaws have met well before"""
+"""a stop's lengths over the widest outer radius: the jaws have met well before"""
 
 THICKNESSES = (1e-3, 10.0)
 """a layer's thickness over its inner radius"""
@@ -46,7 +50,7 @@ def check(scene: Scene) -> None:
         check_closing,
         check_jaw,
         check_mesh,
-        check_travel,
+        check_stop,
         check_solver,
     )
     for one in checks:
@@ -54,26 +58,34 @@ def check(scene: Scene) -> None:
 
 
 def check_signs(record: Any, path: str = "") -> None:
-    """Every quantity is finite, and positive where it has to be.
+    """Every quantity, and every item of an array of them, is finite, and positive where it has to be.
 
     Less than the ranges of a file: differences, and studies of one's own, may step over their ends.
     """
     for field in dataclasses.fields(record):
         value, name = getattr(record, field.name), schema.join(path, schema.file_key(field))
         if "range" in field.metadata:
-            interval = field.metadata["range"]
-            numbers = np.atleast_1d(np.asarray(value, float))
-            positive = interval.open_lower and interval.lower == 0.0
-            if not np.all(np.isfinite(numbers)) or (positive and not np.all(numbers > 0.0)):
-                shown = np.asarray(value, float) / UNIT_FACTOR[interval.unit]
-                raise refuse(name, shown.tolist(), str(interval))
-        elif isinstance(value, tuple):
-            parts = [(part, f"{name}[{i}]") for i, part in enumerate(value)]
-            for part, where in parts:
-                if dataclasses.is_dataclass(part):
-                    check_signs(part, where)
-        elif dataclasses.is_dataclass(value):
-            check_signs(value, name)
+            _check_sign(value, field.metadata["range"], name)
+        for where, part in _parts(value, name):
+            if dataclasses.is_dataclass(part):
+                check_signs(part, where)
+
+
+def _parts(value: Any, name: str) -> list[tuple[str, Any]]:
+    """A value, or the items of a tuple, with their names."""
+    if isinstance(value, tuple):
+        return [(f"{name}[{i}]", part) for i, part in enumerate(value)]
+    return [(name, value)]
+
+
+def _check_sign(value: Any, interval: Range, name: str) -> None:
+    """A number in internal units, or an array of them (any shape), is finite and positive if it has to be."""
+    numbers = np.asarray(value, float)
+    positive = interval.open_lower and interval.lower == 0.0
+    wrong = ~np.isfinite(numbers) | (positive & ~(numbers > 0.0))
+    for position in np.argwhere(wrong):
+        where = name + "".join(f"[{i}]" for i in position)
+        raise refuse(where, float(numbers[tuple(position)]) / UNIT_FACTOR[interval.unit], str(interval))
 
 
 def check_names(scene: Scene) -> None:
@@ -127,7 +139,7 @@ def check_closing(scene: Scene) -> None:
 def _close(layer: Layer, inner_squared: float | None, path: str) -> tuple[float, float]:
     """Square of the closed outer radius (mm2) and mean circumferential stretch of one layer.
 
-    The map of `meshes.closed_radii`: r**2 = r_i**2 + (R**2 - R_i**2) / k, where the innermost
+    The map of `fem.tube.closed_radii`: r**2 = r_i**2 + (R**2 - R_i**2) / k, where the innermost
     layer (`inner_squared` None) keeps the length of its middle surface.
     """
     degrees = float(layer.opening_angle) / UNIT_FACTOR["deg"]
@@ -167,10 +179,11 @@ def check_mesh(scene: Scene) -> None:
         raise BadKey(f"{said}: expected at most {MOST_CELLS}")
 
 
-def check_travel(scene: Scene) -> None:
-    """The jaws do not travel far beyond the artery."""
-    if isinstance(scene.stop, TravelStop):
-        _check_ratio("stop.travel_mm", scene.stop.travel, TRAVELS, _widest(scene))
+def check_stop(scene: Scene) -> None:
+    """A stop's lengths, such as the jaws' travel, do not go far beyond the artery."""
+    for key, field in schema.fields_by_key(type(scene.stop)).items():
+        if "range" in field.metadata and field.metadata["range"].unit == "mm":
+            _check_ratio(f"stop.{key}", getattr(scene.stop, field.name), TRAVELS, _widest(scene))
 
 
 def check_jaw(scene: Scene) -> None:

@@ -1,15 +1,15 @@
 """What a clamping is: artery, clamp, stop, and the numerical choices. Plain frozen data.
 
 Every float can be differentiated; every string, integer and tuple of them is a static choice.
-Units inside are mm, kPa, mN and radians. Build scenes with `jaxclamp.load_scene` (validated) and
-change them with `replace`, which also works on traced values.
+Units inside are mm, kPa, mN and radians; the ranges are in the units of scene files. Build scenes with
+`jaxclamp.load_scene` (validated) and change them with `jaxclamp.replace`, which also works on traced
+values. A field annotated `Array` holds one number unless it says otherwise.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import re
-from typing import Any
+import abc
+from typing import ClassVar
 
 from jax import Array
 
@@ -24,6 +24,7 @@ class Layer:
     """One layer of the wall, stress-free as an opened-up circular sector of its own."""
 
     name: str = static()
+    """what results call it, such as media"""
     inner_radius: Array = quantity("mm", 0.0, 1e3, open_lower=True)
     """inner radius of the open sector"""
     thickness: Array = quantity("mm", 0.0, 1e3, open_lower=True)
@@ -31,6 +32,7 @@ class Layer:
     opening_angle: Array = quantity("deg", -350.0, 350.0)
     """360 deg minus the sector's angle: 0 for a closed ring, negative for an overlapping one"""
     material: Material
+    """its law and constants; they may be arrays over quadrature points and cells in scenes made in Python"""
 
 
 @record
@@ -52,33 +54,46 @@ class Clamp:
     """Two jaws alike, closing symmetrically across the artery."""
 
     jaw: Jaw
+    """the shape of both"""
+
+
+class Stop(abc.ABC):
+    """When closing ends. A stop is one record with its target, the only quantity, and a name of its own.
+
+    Scene files tell stops apart by the target's key, such as `travel_mm`.
+    """
+
+    CHOSEN_BY_KEY: ClassVar[bool] = True
+
+    kind: str
+    """what the stop is called in results"""
 
 
 @record
-class OcclusionStop:
+class OcclusionStop(Stop):
     """Close until 1 - lumen height / physiological lumen diameter, at mid-length, is reached."""
 
     kind: str = static("occlusion")
     occlusion: Array = quantity("", 1e-4, 0.999)
+    """0: as in the body, 1: closed"""
 
 
 @record
-class TravelStop:
+class TravelStop(Stop):
     """Move each jaw by a given distance from its first contact."""
 
     kind: str = static("travel")
     travel: Array = quantity("mm", 0.0, 1e3)
+    """of one jaw"""
 
 
 @record
-class ForceStop:
+class ForceStop(Stop):
     """Close until the force on one jaw (whole artery) is reached."""
 
     kind: str = static("force")
     force: Array = quantity("N", 1e-6, 1e4)
-
-
-Stop = OcclusionStop | TravelStop | ForceStop
+    """on one jaw; mN inside"""
 
 
 @record
@@ -99,6 +114,8 @@ class MeshSettings:
     """q1p0: 8 nodes, mean dilatation; q2p1: 27 nodes, linear discontinuous pressure"""
     contact_points: int = static(4)
     """contact quadrature points per facet and direction (more between inner walls where nodes need it)"""
+    symmetry: str = static("auto", choices=("auto", "xyz", "xy", "xz", "yz", "x", "y", "z", "none"))
+    """mirror planes of the modelled part, by their normals; auto: all that hold"""
 
 
 @record
@@ -118,45 +135,16 @@ class Scene:
     """One clamping: everything that `jaxclamp.clamp` needs."""
 
     title: str = static("")
+    """what results are headed with"""
     artery: Artery
+    """what is clamped"""
     clamp: Clamp
+    """with what"""
     stop: Stop
+    """and how far"""
     contact: Contact
+    """how jaws and wall, and opposite inner walls, keep apart"""
     mesh: MeshSettings
+    """how finely it is computed"""
     solver: SolverSettings
-
-
-_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+\])*)")
-
-
-def _parse(path: str) -> list[str | int]:
-    steps: list[str | int] = []
-    for part in path.split("."):
-        match = _STEP.fullmatch(part)
-        if match is None:
-            raise KeyError(f"'{path}' is not a path like 'artery.layers[0].material.c'")
-        steps.append(match.group(1))
-        steps += [int(i) for i in re.findall(r"\d+", match.group(2))]
-    return steps
-
-
-def replace(scene: Any, path: str, value: Any) -> Any:
-    """A copy of `scene` with the value at `path` (such as "artery.layers[0].material.c") replaced.
-
-    Works on traced values. Raises KeyError if the path does not exist.
-    """
-    return _replace(scene, _parse(path), value, path)
-
-
-def _replace(node: Any, steps: list[str | int], value: Any, path: str) -> Any:
-    if not steps:
-        return value
-    step, rest = steps[0], steps[1:]
-    if isinstance(step, int):
-        if not isinstance(node, tuple) or step >= len(node):
-            raise KeyError(f"'{path}' does not exist: there is no item [{step}]")
-        return (*node[:step], _replace(node[step], rest, value, path), *node[step + 1 :])
-    names = [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
-    if step not in names:
-        raise KeyError(f"'{path}' does not exist: '{step}' is not one of {', '.join(names) or 'no fields'}")
-    return dataclasses.replace(node, **{step: _replace(getattr(node, step), rest, value, path)})
+    """and how accurately solved"""

@@ -2,7 +2,8 @@
 
 The records' fields are the schema: a key is the field's name and unit (`radius_mm`), its range is
 the field's, its default the field's. An abstract record (a material, a jaw) is chosen by the
-value of its tag (`law = "hgo"`), one of several alternatives (a stop) by the keys that are there.
+value of its tag (`law = "hgo"`), or by the key that is there if the base says `CHOSEN_BY_KEY = True`
+(a stop): a new record below such a base is known as soon as its class exists.
 Numbers become floats in internal units (mm, kPa, mN, radians).
 """
 
@@ -11,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-import types
 from collections.abc import Sequence
 from datetime import date, time
 from typing import Any, get_args, get_origin, get_type_hints
@@ -20,11 +20,12 @@ import numpy as np
 
 from jaxclamp.core.failures import BadKey
 from jaxclamp.core.records import UNIT_FACTOR, Range, concrete_subclasses
-from jaxclamp.scenes.presets import did_you_mean, nearest
+from jaxclamp.scenes.wording import did_you_mean, nearest, shortened
 
 MOST_ITEMS = 200
 """longest list of numbers or of layers"""
 LONGEST_TEXT = 200
+"""characters of a title or a name"""
 
 
 def refuse(path: str, value: Any, expected: str, choices: Sequence[str] = ()) -> BadKey:
@@ -34,16 +35,17 @@ def refuse(path: str, value: Any, expected: str, choices: Sequence[str] = ()) ->
     return BadKey(f"{path} = {shown(value)}: expected {expected}{hint}")
 
 
-def shown(value: Any, longest: int = 60) -> str:
+def shown(value: Any) -> str:
     """A value as it would stand in TOML, on one line and not too long."""
     try:
         text = toml_value(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, a list of lists of lists
         text = "..."
-    return text if len(text) <= longest else text[: longest - 3] + "..."
+    return shortened(text)
 
 
 def join(path: str, key: str) -> str:
+    """The path of a key in the table at `path`."""
     return f"{path}.{bare(key)}" if path else bare(key)
 
 
@@ -71,6 +73,16 @@ def fields_by_key(cls: type) -> dict[str, dataclasses.Field[Any]]:
     return {file_key(f): f for f in dataclasses.fields(cls) if not is_tag(f)}
 
 
+def is_chosen_by_key(base: Any) -> bool:
+    """True for a base whose records are told apart by their keys (itself, not the records below it)."""
+    return bool(vars(base).get("CHOSEN_BY_KEY", False)) and not dataclasses.is_dataclass(base)
+
+
+def owners(base: type) -> dict[str, type]:
+    """The records below a base that is chosen by key, by each key of theirs."""
+    return {key: cls for cls in concrete_subclasses(base) for key in fields_by_key(cls)}
+
+
 def tag_of(cls: type) -> tuple[str, str]:
     """Name and value of the tag of a record class."""
     return next((f.name, str(f.default)) for f in dataclasses.fields(cls) if is_tag(f))
@@ -90,11 +102,11 @@ def is_required(field: dataclasses.Field[Any], hint: Any) -> bool:
 
 
 def read(kind: Any, table: Any, path: str = "") -> Any:
-    """The record of class `kind` (abstract, a union, or plain) that `table` describes."""
+    """The record of class `kind` (a base, or a record itself) that `table` describes. Raises BadKey."""
     if not isinstance(table, dict):
         raise refuse(path, table, f"a table with {_main_keys(kind)}")
-    if isinstance(kind, types.UnionType):
-        return _read_record(_alternative(get_args(kind), table, path), table, path)
+    if is_chosen_by_key(kind):
+        return _read_record(_by_key(kind, table, path), table, path)
     if inspect.isabstract(kind):
         kind = _tagged(kind, table, path)
         tag, name = tag_of(kind)
@@ -104,8 +116,8 @@ def read(kind: Any, table: Any, path: str = "") -> Any:
 
 
 def _main_keys(kind: Any) -> str:
-    if isinstance(kind, types.UnionType):
-        return "exactly one of " + ", ".join(key for cls in get_args(kind) for key in fields_by_key(cls))
+    if is_chosen_by_key(kind):
+        return f"exactly one of {', '.join(owners(kind))}"
     if inspect.isabstract(kind):
         return f"{tag_of(concrete_subclasses(kind)[0])[0]} = one of {_listed(_tags(kind))}"
     return ", ".join(fields_by_key(kind))
@@ -131,9 +143,9 @@ def _tagged(base: type, table: dict[str, Any], path: str) -> type:
     return known[chosen]
 
 
-def _alternative(classes: Sequence[type], table: dict[str, Any], path: str) -> type:
-    """The one of several records whose key is in the table."""
-    owner = {key: cls for cls in classes for key in fields_by_key(cls)}
+def _by_key(base: type, table: dict[str, Any], path: str) -> type:
+    """The one record below `base` whose key is in the table."""
+    owner = owners(base)
     _refuse_unknown(table, list(owner), path)
     chosen = {owner[key] for key in table}
     if len(chosen) != 1:
@@ -144,7 +156,8 @@ def _alternative(classes: Sequence[type], table: dict[str, Any], path: str) -> t
 def _refuse_unknown(table: dict[str, Any], known: list[str], path: str, of: str = "") -> None:
     for key in table:
         if key not in known:
-            raise BadKey(f"unknown key {join(path, key)}{of}; {did_you_mean(key, known)}")
+            place = f"{path}.{shortened(bare(key))}" if path else shortened(bare(key))
+            raise BadKey(f"unknown key {place}{of}; {did_you_mean(key, known)}")
 
 
 def _read_record(cls: type, table: dict[str, Any], path: str, of: str = "") -> Any:
@@ -254,33 +267,45 @@ def _is_text(value: Any, field: dataclasses.Field[Any]) -> bool:
 # ------------------------------------------------------------------------------------- writing
 
 
-def table(record: Any) -> dict[str, Any]:
-    """The table that `read` turns into an equal record: the tag first, then every key."""
+def table(record: Any, path: str = "") -> dict[str, Any]:
+    """The table that `read` turns into an equal record: the tag first, then every key.
+
+    path: where the record is, for refusals. Raises BadKey for an array where a file holds one number.
+    """
     result: dict[str, Any] = {}
     for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
+        value, key = getattr(record, field.name), file_key(field)
         if is_tag(field):
-            if any(inspect.isabstract(base) for base in type(record).__mro__):
-                result[field.name] = value
+            if _is_chosen_by_tag(type(record)):
+                result[key] = value
         elif "range" in field.metadata:
-            factor = UNIT_FACTOR[field.metadata["range"].unit]
-            numbers = np.asarray(value, dtype=float)
-            many = field.metadata["many"]
-            result[file_key(field)] = (
-                [_in_file_unit(v, factor) for v in numbers.tolist()]
-                if many
-                else _in_file_unit(float(numbers), factor)
-            )
+            result[key] = _numbers(field, value, join(path, key))
         elif field.metadata.get("static"):
-            result[field.name] = list(value) if isinstance(value, tuple) else value
+            result[key] = list(value) if isinstance(value, tuple) else value
         elif isinstance(value, tuple):
-            result[field.name] = [table(item) for item in value]
+            result[key] = [table(item, f"{join(path, key)}[{i}]") for i, item in enumerate(value)]
         else:
-            result[field.name] = table(value)
+            result[key] = table(value, join(path, key))
     return result
 
 
-def _in_file_unit(value: float, factor: float) -> float:
+def _is_chosen_by_tag(cls: type) -> bool:
+    return any(inspect.isabstract(base) and not is_chosen_by_key(base) for base in cls.__mro__)
+
+
+def _numbers(field: dataclasses.Field[Any], value: Any, path: str) -> float | list[float]:
+    """A quantity in the file's unit: one number, or a list of them."""
+    factor, many = UNIT_FACTOR[field.metadata["range"].unit], field.metadata["many"]
+    numbers = np.asarray(value, dtype=float)
+    if numbers.ndim != int(many):
+        expected = "a list of numbers" if many else "one number"
+        raise BadKey(f"{path} is an array of shape {numbers.shape}: a scene file holds {expected} there")
+    return (
+        [in_file_unit(v, factor) for v in numbers.tolist()] if many else in_file_unit(float(numbers), factor)
+    )
+
+
+def in_file_unit(value: float, factor: float) -> float:
     """The shortest number that, times `factor`, gives `value` again (else the nearest one)."""
     exact = value / factor
     candidates = [float(f"{exact:.{digits}g}") for digits in (14, 15, 16)]

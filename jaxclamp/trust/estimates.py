@@ -16,12 +16,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, Singular
-from jaxclamp.scenes.scene import MeshSettings, Scene, replace
+from jaxclamp.scenes.address import get, replace
+from jaxclamp.scenes.scene import MeshSettings, Scene
 from jaxclamp.solve.clamping import clamp, inflate, predicted
 from jaxclamp.solve.results import Result
 
@@ -141,10 +141,7 @@ def _from_a_penalty(
 
 
 def multiplied(scene: Scene, paths: tuple[str, ...], factor: float) -> Scene:
-    """A scene with the penalties at some paths (of layers' bulk moduli, of contact) multiplied."""
+    """A scene with the numbers at some addresses (of penalties, such as layers' bulk moduli) multiplied."""
     for path in paths:
-        owner: Any = scene.contact
-        if path.startswith("artery"):
-            owner = scene.artery.layers[int(path.split("[")[1].split("]")[0])].material
-        scene = replace(scene, path, factor * float(getattr(owner, path.rpartition(".")[2])))
+        scene = replace(scene, path, factor * get(scene, path))
     return scene

@@ -27,7 +27,8 @@ from jaxclamp.core.progress import Progress
 from jaxclamp.observe.measures import smooth_peak_axial_stress
 from jaxclamp.observe.stresses import layer_of_P
 from jaxclamp.potential.tangent import linearise
-from jaxclamp.scenes.scene import MeshSettings, OcclusionStop, Scene, replace
+from jaxclamp.scenes.address import replace
+from jaxclamp.scenes.scene import MeshSettings, OcclusionStop, Scene
 from jaxclamp.sensitivity.implicit import evaluate
 from jaxclamp.solve.clamping import clamp
 from jaxclamp.solve.linear_solvers import available

@@ -6,21 +6,22 @@ the comments after it name the sources. Names are unique over all kinds.
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 
 from jaxclamp.core.failures import SceneError
+from jaxclamp.scenes.wording import did_you_mean, shortened
 
 FOLDER = Path(__file__).parent
+"""where the presets are"""
 
-# kind -> its folder, and what a preset of that kind is used for
 KINDS = {
     "scene": ("scenes", "as SCENE"),
     "artery": ("arteries", "as the value of artery"),
     "jaw": ("jaws", "as the value of clamp.jaw"),
     "study": ("studies", "as STUDY of jaxclamp optimise"),
 }
+"""kind -> its folder, and what a preset of that kind is used for"""
 
 
 @dataclass(frozen=True)
@@ -28,15 +29,20 @@ class Preset:
     """One shipped TOML file."""
 
     name: str
+    """its file's name without .toml"""
     kind: str
+    """a key of `KINDS`"""
     path: Path
+    """where the file is"""
 
     @property
     def text(self) -> str:
+        """What is in the file."""
         return self.path.read_text(encoding="utf-8")
 
     @property
     def title(self) -> str:
+        """Its first line, without the #."""
         return self.text.partition("\n")[0].removeprefix("#").strip()
 
 
@@ -55,21 +61,8 @@ def preset(name: str, kind: str | None = None) -> Preset:
     found = {each.name: each for each in presets()}.get(name)
     if found is None:
         wanted = [each.name for each in presets(kind)]
-        raise SceneError(
-            f"there is no preset {f'{kind} ' if kind else ''}called {name!r}; {did_you_mean(name, wanted)}"
-        )
+        sought = f"preset {kind}" if kind else "preset"
+        raise SceneError(f"there is no {sought} called {shortened(name)!r}; {did_you_mean(name, wanted)}")
     if kind not in (None, found.kind):
         raise SceneError(f"the preset {name!r} is no {kind}: it is to be used {KINDS[found.kind][1]}")
     return found
-
-
-def nearest(word: str, known: list[str]) -> str | None:
-    """What was probably meant: the same word with a unit, or one that differs by a slip."""
-    same = [k for k in known if k.lower() == word.lower() or k.startswith(f"{word}_")]
-    return next(iter(same + difflib.get_close_matches(word, known, n=1, cutoff=0.5)), None)
-
-
-def did_you_mean(word: str, known: list[str]) -> str:
-    """'did you mean X?', or the list of what is known where nothing is near."""
-    near = nearest(word, known)
-    return f"did you mean {near}?" if near else f"known here: {', '.join(known)}"

@@ -1,0 +1,55 @@
+"""Fidelities: a mesh by one word, and the errors to expect of it."""
+
+from __future__ import annotations
+
+from jaxclamp.scenes import schema
+from jaxclamp.scenes.scene import Artery, MeshSettings
+
+COUNTS = ("circumferential", "axial", "radial")
+"""the keys of a mesh that a fidelity decides"""
+
+FIDELITIES = {"draft": (7, 10, 5), "standard": (10, 15, 8), "reference": (20, 30, 16)}
+"""elements over the quarter circumference, over the half length, through the wall"""
+
+EXPECTED_ERRORS = {
+    "draft": {
+        "smooth axial peak": 0.04,
+        "jaw force": 0.06,
+        "stress at P": 0.05,
+        "lumen radius": 0.003,
+    },
+    "standard": {
+        "smooth axial peak": 0.02,
+        "jaw force": 0.04,
+        "stress at P": 0.03,
+        "lumen radius": 0.002,
+    },
+    "reference": {
+        "smooth axial peak": 0.01,
+        "jaw force": 0.02,
+        "stress at P": 0.005,
+        "lumen radius": 0.002,
+    },
+}
+"""relative errors measured on human-lad, rounded: docs/accuracy-human-lad.md; the peak is the media's"""
+
+
+def mesh_for(fidelity: str, artery: Artery) -> MeshSettings:
+    """The mesh of a fidelity: the radial elements are shared out by the layers' thickness."""
+    circumferential, axial, radial = FIDELITIES[fidelity]
+    if fidelity == "reference":
+        counts = tuple(2 * count for count in mesh_for("standard", artery).radial)
+    else:
+        counts = _shares(radial, [float(layer.thickness) for layer in artery.layers])
+    values = dict(zip(COUNTS, (circumferential, axial, list(counts)), strict=True))
+    return schema.read(MeshSettings, values, "mesh")
+
+
+def _shares(total: int, sizes: list[float]) -> tuple[int, ...]:
+    """`total` shared out in proportion to `sizes`, by largest remainder, at least one each."""
+    quotas = [total * size / sum(sizes) for size in sizes]
+    counts = [int(quota) for quota in quotas]
+    by_remainder = sorted(range(len(sizes)), key=lambda i: counts[i] - quotas[i])
+    for i in by_remainder[: total - sum(counts)]:
+        counts[i] += 1
+    return tuple(max(1, count) for count in counts)
