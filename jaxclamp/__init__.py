@@ -29,6 +29,7 @@ from jaxclamp.observe.measures import (  # noqa: E402
     stored_energy,
     volume_above,
 )
+from jaxclamp.observe.stops import ForceStop, OcclusionStop, TravelStop  # noqa: E402
 from jaxclamp.scenes.address import replace  # noqa: E402
 from jaxclamp.scenes.files import dump_scene, load_scene  # noqa: E402
 from jaxclamp.scenes.scene import Scene  # noqa: E402

@@ -79,6 +79,12 @@ class EquilibriumError(Failure):
         return EquilibriumError, (self.stage, self.load, self.failure, self.advice)
 
 
+class TermMissing(Failure):
+    """A term of the potential that was left out is needed after all: the caller starts again with it."""
+
+    exit_code = 3
+
+
 class Singular(Failure):
     """The matrix could not be factored, or its solutions are inaccurate."""
 

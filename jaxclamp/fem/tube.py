@@ -1,134 +1,76 @@
-"""The layered tube as structured hexahedra, from stress-free open sectors to one closed wedge.
+"""The layered tube: where the nodes of a block lie, from stress-free open sectors to one closed tube.
 
-The modelled part is a quarter of the circumference (from the fold at theta = 0, the x axis, to
-the compression axis at theta = 90 deg, the y axis) by half the length (from the clamp plane z = 0
-to the artery's end). Each cell has its own stress-free coordinates, in the open sector of its
-layer; all cells share the current coordinates of the nodes of the closed tube. A node on the
+The angle is counted from the fold (the x axis) over the compression axis (the y axis, 90 deg) on, the
+length from the clamp plane (z = 0). Each cell has its own stress-free coordinates, in the open sector of
+its layer; all cells share the current coordinates of the nodes of the closed tube. A node on the
 interface of two layers has therefore two stress-free positions and one current one.
 
-Topology (`Mesh`) is integers and fixed fractions, made once with numpy; positions are functions
-of the scene's floats, in JAX. Sizes: n_en nodes per cell, n_fn nodes per facet.
+The counts and gradings of `MeshSettings` are those of a quarter of the circumference and half the length;
+a model of more than that is the same mesh, mirrored. Positions are functions of the scene's floats, in JAX.
 """
 
 from __future__ import annotations
-
-import math
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxclamp.core.records import record, static
-from jaxclamp.fem.elements import ELEMENTS, Element
+from jaxclamp.fem.grid import Mesh, build_block
+from jaxclamp.fem.symmetry import symmetry_of
 from jaxclamp.scenes.scene import Artery, MeshSettings
 
 
-@record
-class Mesh:
-    """Topology of the wedge. Cells are ordered layer by layer from inside to outside."""
-
-    element: Element = static()
-    grid: tuple[int, int, int] = static()
-    """nodes along (radial, circumferential, axial)"""
-    cells: np.ndarray
-    """node of each cell corner, (n_en, n_cells)"""
-    cell_fraction: np.ndarray
-    """position of the cell's nodes through their layer, 0 inside to 1 outside, (n_en, n_cells)"""
-    layer_cells: tuple[tuple[int, int], ...] = static()
-    """first and last-plus-one cell of each layer"""
-    node_layer: np.ndarray
-    """layer of each radial grid line for the closed guess (inner one at interfaces), (n_r,)"""
-    node_fraction: np.ndarray
-    """position of each radial grid line through that layer, (n_r,)"""
-    lumen_facets: np.ndarray
-    """nodes of the inner facets, (n_fn, n_facets)"""
-    outer_facets: np.ndarray
-    """nodes of the outer facets, (n_fn, n_facets)"""
-
-    @property
-    def n_nodes(self) -> int:
-        return math.prod(self.grid)
-
-    @property
-    def n_cells(self) -> int:
-        return self.cells.shape[1]
-
-    def node(self, radial: int, circumferential: int, axial: int) -> int:
-        """Number of the node at a grid position; negative positions count from the end."""
-        position = (radial, circumferential, axial)
-        r, c, z = (p % n for p, n in zip(position, self.grid, strict=True))
-        return (z * self.grid[1] + c) * self.grid[0] + r
-
-    def plane(self, axis: int, index: int) -> np.ndarray:
-        """Nodes with grid position `index` along `axis` (0 radial, 1 circumferential, 2 axial)."""
-        numbers = np.arange(self.n_nodes).reshape(self.grid[::-1])
-        return np.take(numbers, index, axis=2 - axis).ravel()
-
-    @property
-    def fold_plane(self) -> np.ndarray:
-        """Nodes with y = 0."""
-        return self.plane(1, 0)
-
-    @property
-    def compression_plane(self) -> np.ndarray:
-        """Nodes with x = 0."""
-        return self.plane(1, -1)
-
-    @property
-    def clamp_plane(self) -> np.ndarray:
-        """Nodes with z = 0."""
-        return self.plane(2, 0)
-
-    @property
-    def end_plane(self) -> np.ndarray:
-        """Nodes at the artery's end."""
-        return self.plane(2, -1)
-
-    def layer_inner_line(self, layer: int) -> int:
-        """Radial grid position of the inner surface of a layer."""
-        return int(np.searchsorted(self.node_layer, layer)) - (layer > 0)
-
-
-def build_mesh(settings: MeshSettings) -> Mesh:
-    """Topology for the given counts; the order of cells is layer, axial, circumferential, radial."""
-    element = ELEMENTS[settings.element]
-    m = element.order
-    n_radial = sum(settings.radial)
-    grid = (m * n_radial + 1, m * settings.circumferential + 1, m * settings.axial + 1)
-    number = lambda r, c, z: (z * grid[1] + c) * grid[0] + r  # noqa: E731
-
-    cells, fractions, layer_cells = [], [], []
-    node_layer, node_fraction = [0], [0.0]
-    first_radial, first_cell = 0, 0
-    for layer, count in enumerate(settings.radial):
-        z, c, r = np.meshgrid(
-            np.arange(settings.axial), np.arange(settings.circumferential), np.arange(count), indexing="ij"
-        )
-        local = element.node_grid[:, :, None]
-        radial = m * r.ravel() + local[:, 0]
-        nodes = number(m * first_radial + radial, m * c.ravel() + local[:, 1], m * z.ravel() + local[:, 2])
-        cells.append(nodes)
-        fractions.append(radial / (m * count))
-        layer_cells.append((first_cell, first_cell + nodes.shape[1]))
-        node_layer += [layer] * (m * count)
-        node_fraction += [(k + 1) / (m * count) for k in range(m * count)]
-        first_radial += count
-        first_cell += nodes.shape[1]
-
-    along, around = np.meshgrid(np.arange(settings.axial), np.arange(settings.circumferential), indexing="ij")
-    corner = element.facet_grid[:, :, None]
-    facet = lambda r: number(r, m * around.ravel() + corner[:, 0], m * along.ravel() + corner[:, 1])  # noqa: E731
-    return Mesh(
-        element=element,
-        grid=grid,
-        cells=np.concatenate(cells, axis=1),
-        cell_fraction=np.concatenate(fractions, axis=1),
-        layer_cells=tuple(layer_cells),
-        node_layer=np.array(node_layer),
-        node_fraction=np.array(node_fraction),
-        lumen_facets=facet(0),
-        outer_facets=facet(grid[0] - 1),
+def build_tube(settings: MeshSettings) -> Mesh:
+    """Topology of the modelled part of the tube."""
+    symmetry = symmetry_of(settings.symmetry)
+    around, along = (span[1] - span[0] for span in (symmetry.quarters, symmetry.halves))
+    return build_block(
+        settings.element,
+        settings.radial,
+        around * settings.circumferential,
+        along * settings.axial,
+        symmetry.wraps,
     )
+
+
+def circumferential_line(mesh: Mesh, settings: MeshSettings, quarter: int) -> int | None:
+    """Grid line at so many right angles from the fold; None where that is not modelled."""
+    first, last = symmetry_of(settings.symmetry).quarters
+    if mesh.wraps:
+        return mesh.element.order * settings.circumferential * (quarter % 4)
+    inside = [k for k in (quarter, quarter - 4, quarter + 4) if first <= k <= last]
+    return mesh.element.order * settings.circumferential * (inside[0] - first) if inside else None
+
+
+def middle_line(mesh: Mesh, settings: MeshSettings) -> int:
+    """Axial grid line at mid-length."""
+    return -symmetry_of(settings.symmetry).halves[0] * settings.axial * mesh.element.order
+
+
+def end_lines(settings: MeshSettings) -> tuple[int, ...]:
+    """Axial grid lines at the artery's ends."""
+    return (-1,) if "z" in symmetry_of(settings.symmetry) else (0, -1)
+
+
+def supports(mesh: Mesh, settings: MeshSettings) -> np.ndarray:
+    """True for degrees of freedom that do not move across the artery or out of a plane, (n_nodes, 3).
+
+    Mirror planes hold their normal displacement, and the planar ends their axial one. Without the plane
+    y = 0 (x = 0) nothing but the jaws would say how high (how far aside) the artery lies: its ends then
+    keep their place across along their horizontal (vertical) diameter, where a mirror plane would hold
+    them. No force and no parameter is added: where the mirror plane holds, those supports carry nothing.
+    """
+    symmetry = symmetry_of(settings.symmetry)
+    held = np.zeros((mesh.n_nodes, 3), dtype=bool)
+    ends = np.concatenate([mesh.plane(2, line) for line in end_lines(settings)])
+    for component, axis, quarters in ((0, "x", (1, 3)), (1, "y", (0, 2))):
+        lines = [circumferential_line(mesh, settings, quarter) for quarter in quarters]
+        for nodes in (mesh.plane(1, line) for line in lines if line is not None):
+            held[nodes if axis in symmetry else np.intersect1d(nodes, ends), component] = True
+    if "z" in symmetry:
+        held[mesh.plane(2, 0), 2] = True
+    held[ends, 2] = True
+    return held
 
 
 def _graded(n: int, grading: Array) -> Array:
@@ -141,18 +83,28 @@ def _graded(n: int, grading: Array) -> Array:
 
 
 def angles(mesh: Mesh, settings: MeshSettings) -> Array:
-    """Angle of each circumferential grid line in the closed tube, rad, (n_c,)."""
-    return 0.5 * jnp.pi * _graded(mesh.grid[1], settings.circumferential_grading)
+    """Angle of each circumferential grid line in the closed tube, rad, (n_c,); where it wraps, and 2 pi."""
+    n = mesh.element.order * settings.circumferential
+    share = _graded(n + 1, settings.circumferential_grading)  # of a right angle, from the fold
+    first, last = symmetry_of(settings.symmetry).quarters
+    lines = [k + share if k % 2 == 0 else k + 1 - share[::-1] for k in range(first, last)]
+    return 0.5 * jnp.pi * jnp.concatenate([lines[0], *(line[1:] for line in lines[1:])])
 
 
 def axial_fractions(mesh: Mesh, settings: MeshSettings) -> Array:
-    """Position of each axial grid line, 0 at the clamp to 1 at the end, (n_z,)."""
-    return _graded(mesh.grid[2], settings.axial_grading)
+    """Position of each axial grid line over half the length, 0 at the clamp to 1 at the end, (n_z,)."""
+    half = _graded(mesh.element.order * settings.axial + 1, settings.axial_grading)
+    return half if mesh.grid[2] == half.shape[0] else jnp.concatenate([-half[:0:-1], half])
 
 
 def _heights(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """Load-free axial position of each axial grid line, mm, (n_z,)."""
-    return 0.5 * artery.length * axial_fractions(mesh, settings)
+    return end_height(artery, 1.0) * axial_fractions(mesh, settings)
+
+
+def end_height(artery: Artery, axial_stretch: Array | float) -> Array:
+    """Distance of the artery's ends from mid-length at a stretch, mm."""
+    return 0.5 * artery.length * axial_stretch
 
 
 def sector_share(opening_angle: Array) -> Array:
@@ -163,7 +115,7 @@ def sector_share(opening_angle: Array) -> Array:
 def stress_free_positions(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """Position of each cell's nodes in the open sector of its layer, mm, (3, n_en, n_cells)."""
     n_r, n_c, _ = mesh.grid
-    angle = angles(mesh, settings)[mesh.cells // n_r % n_c]
+    angle = angles(mesh, settings)[mesh.cell_line]
     height = _heights(mesh, settings, artery)[mesh.cells // (n_r * n_c)]
     radius, opened = [], []
     for layer, (first, last) in zip(artery.layers, mesh.layer_cells, strict=True):
@@ -194,7 +146,8 @@ def closed_radii(mesh: Mesh, artery: Artery) -> Array:
 
 def closed_positions(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """A guess of the load-free position of each node, mm, (n_nodes, 3)."""
+    around = angles(mesh, settings)[: mesh.grid[1]]
     z, theta, r = jnp.meshgrid(
-        _heights(mesh, settings, artery), angles(mesh, settings), closed_radii(mesh, artery), indexing="ij"
+        _heights(mesh, settings, artery), around, closed_radii(mesh, artery), indexing="ij"
     )
     return jnp.stack([r * jnp.cos(theta), r * jnp.sin(theta), z], axis=-1).reshape(-1, 3)

@@ -1,6 +1,6 @@
 """What is minimised, constrained or differentiated: one number of the equilibria of a scene.
 
-A `Measure` is a function of what is `Seen` of a scene: the body, and its states in the body and at
+A `Measure` is a function of the `Equilibria` of a scene: its potential, and its states in the body and at
 the stop. Values are in internal units: mm, kPa, mN, uJ. Maxima are smooth (volume- or
 area-weighted power means, see `tensors.smooth_maximum`), so that they can be differentiated where
 the place of the true peak jumps; `Result` gives the true peaks beside them.
@@ -16,23 +16,16 @@ import jax.numpy as jnp
 from jax import Array
 from jax.nn import sigmoid
 
-from jaxclamp.core.records import record
-from jaxclamp.core.tensors import smooth_maximum
-from jaxclamp.observe import stresses as measures
-from jaxclamp.observe.stresses import PARTS, PARTS_OF_A_JAW, PEAK_SHARPNESS, Landmarks, layer_stresses
-from jaxclamp.potential.tangent import Body, State, contact_potential
-from jaxclamp.potential.tangent import stored_energy as _stored_energy
+from jaxclamp.core.tensors import smooth_maximum, total
+from jaxclamp.fem import landmarks
+from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.stresses import facet_contact, touching
+from jaxclamp.potential.energy import group_energy
+from jaxclamp.potential.energy import stored_energy as _stored_energy
+from jaxclamp.potential.terms import JAWS, Potential
 
-
-@record
-class Seen:
-    """A scene's body and its equilibria."""
-
-    body: Body
-    marks: Landmarks
-    physiological: State
-    stop: State | None
-    """None for a measure that needs only the physiological state"""
+PEAK_SHARPNESS = 40.0
+"""exponent of the power mean that stands for a maximum"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,14 +33,19 @@ class Measure:
     """A scalar function of the equilibria. Two measures of one name and arguments are equal."""
 
     name: str
+    """such as smooth_peak_axial_stress"""
     unit: str
+    """internal unit: mm, kPa, mN, uJ, or none"""
     function: Callable[..., Array]
+    """of the equilibria and the arguments: a JAX scalar"""
     arguments: tuple[str | float, ...] = ()
+    """such as a layer's name"""
     needs_stop: bool = True
+    """False: the physiological state is all that it needs"""
 
-    def __call__(self, seen: Seen) -> Array:
+    def __call__(self, equilibria: Equilibria) -> Array:
         """The value in internal units, a JAX scalar."""
-        return self.function(seen, *self.arguments)
+        return self.function(equilibria, *self.arguments)
 
     def __str__(self) -> str:
         inside = ", ".join(map(str, self.arguments))
@@ -60,37 +58,37 @@ SMOOTHNESS_OF_THRESHOLD = 0.05
 
 def smooth_peak_axial_stress(layer: str) -> Measure:
     """Smooth maximum of the axial stress in a layer at the stop, kPa."""
-    return Measure("smooth_peak_axial_stress", "kPa", _smooth_peak, ("axial", layer))
+    return Measure("smooth_peak_axial_stress", "kPa", smooth_peak, ("axial", layer))
 
 
 def smooth_peak_circumferential_stress(layer: str) -> Measure:
     """Smooth maximum of the circumferential stress in a layer at the stop, kPa."""
-    return Measure("smooth_peak_circumferential_stress", "kPa", _smooth_peak, ("circumferential", layer))
+    return Measure("smooth_peak_circumferential_stress", "kPa", smooth_peak, ("circumferential", layer))
 
 
 def smooth_peak_principal_stress(layer: str) -> Measure:
     """Smooth maximum of the greatest principal stress in a layer at the stop, kPa."""
-    return Measure("smooth_peak_principal_stress", "kPa", _smooth_peak, ("greatest", layer))
+    return Measure("smooth_peak_principal_stress", "kPa", smooth_peak, ("greatest", layer))
 
 
 def axial_stress_at_P() -> Measure:
     """Axial stress at P (inner media, compression axis, mid-length) at the stop, kPa."""
-    return Measure("axial_stress_at_P", "kPa", _stress_at_P, ("axial",))
+    return Measure("axial_stress_at_P", "kPa", stress_at_P, ("axial",))
 
 
 def circumferential_stress_at_P() -> Measure:
     """Circumferential stress at P at the stop, kPa."""
-    return Measure("circumferential_stress_at_P", "kPa", _stress_at_P, ("circumferential",))
+    return Measure("circumferential_stress_at_P", "kPa", stress_at_P, ("circumferential",))
 
 
 def clamp_force() -> Measure:
     """Force on one jaw (whole artery) at the stop, mN."""
-    return Measure("clamp_force", "mN", _clamp_force)
+    return Measure("clamp_force", "mN", force_on_a_jaw)
 
 
 def jaw_travel() -> Measure:
     """Travel of each jaw from its first contact to the stop, mm."""
-    return Measure("jaw_travel", "mm", _jaw_travel)
+    return Measure("jaw_travel", "mm", travel_of_a_jaw)
 
 
 def lumen_height() -> Measure:
@@ -149,85 +147,93 @@ def jaw_half_width() -> Measure:
 # --- the functions ------------------------------------------------------------------------------
 
 
-def _at_stop(seen: Seen) -> State:
-    assert seen.stop is not None
-    return seen.stop
+def smooth_peak(e: Equilibria, component: str, layer: str) -> Array:
+    """Smooth maximum of a component of `Stresses` over the volume of a layer, kPa."""
+    number = e.marks.layer(layer)
+    dV = e.potential.layers[number].terms[0].here.dV
+    return smooth_maximum(getattr(e.stresses(number), component), dV, PEAK_SHARPNESS)
 
 
-def _layer(seen: Seen, name: str) -> int:
-    if name not in seen.marks.layer_names:
-        raise KeyError(f"there is no layer '{name}': expected one of {', '.join(seen.marks.layer_names)}")
-    return seen.marks.layer_names.index(name)
+def stress_at_P(e: Equilibria, component: str) -> Array:
+    """A component of `Stresses` at P, kPa: extrapolated to that node in its cell."""
+    stress = getattr(e.stresses(e.marks.P_layer), component)
+    return jnp.asarray(e.marks.P_weights) @ stress[:, e.marks.P_cell]
 
 
-def _smooth_peak(seen: Seen, component: str, layer: str) -> Array:
-    number = _layer(seen, layer)
-    first, last = seen.body.topology.layer_cells[number]
-    stress = getattr(layer_stresses(seen.body, _at_stop(seen), number), component)
-    return smooth_maximum(stress, seen.body.geometry.dV[:, first:last], PEAK_SHARPNESS)
+def jaw_forces(potential: Potential, x: Array, q: Array) -> Array:
+    """Force on the modelled part of each jaw, against its closing, mN, (n_jaws,)."""
+    of = lambda group: -jax.grad(group_energy, argnums=2)(group, x, q)[0]  # noqa: E731
+    return jnp.stack([of(group) for group in potential.of(JAWS)])
 
 
-def _stress_at_P(seen: Seen, component: str) -> Array:
-    layer = measures.layer_of_P(seen.marks.layer_names)
-    first, _ = seen.body.topology.layer_cells[layer]
-    stress = getattr(layer_stresses(seen.body, _at_stop(seen), layer), component)
-    return jnp.asarray(seen.marks.P_weights) @ stress[:, seen.marks.P_cell - first]
+def force_on_a_jaw(e: Equilibria) -> Array:
+    """Force on one jaw of the whole artery, mN."""
+    modelled = jnp.sum(jaw_forces(e.potential, e.last.x, e.last.q))
+    return e.marks.symmetry.parts_of_a_jaw * modelled
 
 
-def _clamp_force(seen: Seen) -> Array:
-    state = _at_stop(seen)
-    return -PARTS_OF_A_JAW * jax.grad(contact_potential, argnums=2)(seen.body, state.x, state.jaw_height)
+def travel_of_a_jaw(e: Equilibria) -> Array:
+    """Travel of each jaw from its first contact with the artery in the body, mm."""
+    return e.body.x[e.marks.outer_top, 1] - e.last.jaw_height
 
 
-def _jaw_travel(seen: Seen) -> Array:
-    return seen.physiological.x[seen.marks.outer_top, 1] - _at_stop(seen).jaw_height
+def _lumen_height(e: Equilibria) -> Array:
+    return landmarks.lumen_height(e.last.x, e.marks)
 
 
-def _lumen_height(seen: Seen) -> Array:
-    return 2.0 * _at_stop(seen).x[seen.marks.lumen_top, 1]
+def _lumen_width(e: Equilibria) -> Array:
+    return landmarks.lumen_width(e.last.x, e.marks)
 
 
-def _lumen_width(seen: Seen) -> Array:
-    return 2.0 * jnp.max(_at_stop(seen).x[seen.marks.lumen_ring, 0])
+def _lumen_area(e: Equilibria) -> Array:
+    return landmarks.lumen_area(e.last.x, e.marks)
 
 
-def _lumen_area(seen: Seen) -> Array:
-    ring = _at_stop(seen).x[seen.marks.lumen_ring, :2]
-    return measures.lumen_ring_area(ring, seen.marks.element)
+def contact_of_a_jaw(e: Equilibria) -> tuple[Array, Array]:
+    """Mean contact pressure, kPa (0 without contact), and contact area of one jaw, mm^2."""
+    found = [touching(group, e.last) for group in e.potential.of(JAWS)]
+    force = total(jnp.sum(pressure * da) for pressure, da, _ in found)
+    area = total(jnp.sum(da * share) for _, da, share in found)
+    mean = force / jnp.where(area > 0.0, area, 1.0)
+    return jnp.where(area > 0.0, mean, 0.0), e.marks.symmetry.parts_of_a_jaw * area
 
 
-def _mean_contact_pressure(seen: Seen) -> Array:
-    return measures.mean_contact_pressure(seen.body, _at_stop(seen), seen.marks.element)[0]
+def _mean_contact_pressure(e: Equilibria) -> Array:
+    return contact_of_a_jaw(e)[0]
 
 
-def _smooth_peak_contact_pressure(seen: Seen) -> Array:
-    pressure, area = measures.contact_pressure(seen.body, _at_stop(seen), seen.marks.element)
-    return smooth_maximum(pressure, area, PEAK_SHARPNESS)
+def contact_points(e: Equilibria) -> tuple[Array, Array]:
+    """Contact pressure (kPa) and current area (mm^2) of all points at the jaws, (n_q, n_facets) each."""
+    found = [facet_contact(group, e.last) for group in e.potential.of(JAWS)]
+    pressure, area = (jnp.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
+    return pressure, area
 
 
-def _volume_above(seen: Seen, layer: str, threshold: float) -> Array:
-    number = _layer(seen, layer)
-    first, last = seen.body.topology.layer_cells[number]
-    stress = layer_stresses(seen.body, _at_stop(seen), number).axial
-    dV = seen.body.geometry.dV[:, first:last]
+def _smooth_peak_contact_pressure(e: Equilibria) -> Array:
+    return smooth_maximum(*contact_points(e), PEAK_SHARPNESS)
+
+
+def _volume_above(e: Equilibria, layer: str, threshold: float) -> Array:
+    number = e.marks.layer(layer)
+    dV = e.potential.layers[number].terms[0].here.dV
     width = SMOOTHNESS_OF_THRESHOLD * abs(threshold) + 1e-9
-    return jnp.sum(dV * sigmoid((stress - threshold) / width)) / jnp.sum(dV)
+    return jnp.sum(dV * sigmoid((e.stresses(number).axial - threshold) / width)) / jnp.sum(dV)
 
 
-def _wall_energy(seen: Seen) -> Array:
-    return PARTS * _stored_energy(seen.body, _at_stop(seen).x)
+def _wall_energy(e: Equilibria) -> Array:
+    return e.marks.symmetry.parts * _stored_energy(e.potential, e.last.x)
 
 
-def _physiological_radius(seen: Seen) -> Array:
-    return seen.physiological.x[seen.marks.lumen_top, 1]
+def _physiological_radius(e: Equilibria) -> Array:
+    return 0.5 * landmarks.lumen_height(e.body.x, e.marks)
 
 
-def _jaw_curvature(seen: Seen) -> Array:
-    curvatures = jnp.abs(seen.body.parameters.jaw.curvatures())
+def _jaw_curvature(e: Equilibria) -> Array:
+    curvatures = jnp.abs(e.jaw.curvatures())
     return smooth_maximum(curvatures, jnp.full(curvatures.shape, 1.0), PEAK_SHARPNESS) * (
         curvatures.size ** (1.0 / PEAK_SHARPNESS)
     )
 
 
-def _jaw_half_width(seen: Seen) -> Array:
-    return seen.body.parameters.jaw.half_extent()
+def _jaw_half_width(e: Equilibria) -> Array:
+    return e.jaw.half_extent()

@@ -1,26 +1,34 @@
-"""What a scene needs: the modelled part, its unknowns, and the energy terms, each with its reason."""
+"""A scene made ready to compute with: the modelled part, its unknowns, and the terms of its potential."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxclamp.core.records import record, shape_of
-from jaxclamp.fem.tube import Mesh, axial_fractions, build_mesh
-from jaxclamp.observe.stresses import Landmarks, find_landmarks
-from jaxclamp.potential.densities import Parameters, Stencils, build_geometry, build_stencils
-from jaxclamp.potential.tangent import Body, Pattern, Topology, build_topology, supported
-from jaxclamp.scenes.scene import Scene
-from jaxclamp.solve.linear_solvers import available
-
-SYMMETRY = (
-    "one eighth: a quarter of the circumference (planes x = 0 and y = 0) by half the length "
-    "(plane z = 0), because both jaws are alike and the clamp sits in the middle"
+from jaxclamp.fem.grid import Mesh
+from jaxclamp.fem.landmarks import Landmarks, find_landmarks
+from jaxclamp.fem.pattern import Layout, Pattern, Region, build_pattern, cut_into_blocks
+from jaxclamp.fem.stencils import Stencils, build_stencils
+from jaxclamp.fem.symmetry import Symmetry, symmetry_of
+from jaxclamp.fem.tube import build_tube, end_height, end_lines, supports
+from jaxclamp.physics.contact import Contact
+from jaxclamp.potential.bodies import tube_body
+from jaxclamp.potential.terms import (
+    BLOOD,
+    Made,
+    Potential,
+    Term,
+    Volume,
+    all_terms,
+    build_potential,
+    needed,
 )
+from jaxclamp.scenes.scene import Artery, Clamp, MeshSettings, Scene
 
 
 @record
@@ -28,8 +36,11 @@ class Discretisation:
     """What a scene's static choices alone decide: integers and fixed fractions, no physics."""
 
     mesh: Mesh
-    topology: Topology
     stencils: Stencils
+    layout: Layout
+    regions: dict[str, Region]
+    sides: dict[str, np.ndarray]
+    """facets of the upper and (where it is modelled) the lower half"""
     marks: Landmarks
 
 
@@ -40,45 +51,88 @@ class Model:
     scene: Scene
     discretisation: Discretisation
     pattern: Pattern
-    body: Body
+    potential: Potential
+    """with every term, needed or not: derivatives see them all"""
 
     @property
     def mesh(self) -> Mesh:
+        """The mesh of the modelled part."""
         return self.discretisation.mesh
 
     @property
     def marks(self) -> Landmarks:
+        """The places where figures are read."""
         return self.discretisation.marks
 
     @property
-    def half_length(self) -> float:
-        """Load-free length of the modelled part, mm."""
-        return 0.5 * float(self.scene.artery.length)
+    def symmetry(self) -> Symmetry:
+        """The mirror planes in use."""
+        return self.marks.symmetry
+
+    def end_height(self, axial_stretch: float) -> float:
+        """Distance of the artery's ends from mid-length at a stretch, mm."""
+        return float(end_height(self.scene.artery, axial_stretch))
+
+    def solved(self, pressure: float, closing: bool) -> Potential:
+        """The terms that an equilibrium at a pressure needs, with or without the clamp."""
+        names = needed(self.scene, closing)
+        potential = self.potential.at_pressure(pressure)
+        return potential.keeping(lambda name: name in names and (pressure != 0.0 or name != BLOOD))
 
 
 def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
     """Mesh, sparse pattern and landmarks of a scene's static choices."""
-    mesh = build_mesh(scene.mesh)
-    topology, pattern = build_topology(mesh)
-    marks = find_landmarks(mesh, tuple(layer.name for layer in scene.artery.layers))
-    stencils = build_stencils(mesh, scene.mesh)
-    topology, stencils = jax.tree_util.tree_map(jnp.asarray, (topology, stencils))
-    return Discretisation(mesh=mesh, topology=topology, stencils=stencils, marks=marks), pattern
+    mesh = build_tube(scene.mesh)
+    stencils = build_stencils(mesh.element, scene.mesh.contact_points)
+    sides = _sides(mesh, scene.mesh)
+    counts = tuple(last - first for first, last in mesh.layer_cells)
+    size = cut_into_blocks(counts, len(stencils.weights))
+    nodes = {f"layer {i}": (mesh.cells[:, slice(*span)], size) for i, span in enumerate(mesh.layer_cells)}
+    nodes["lumen"] = (mesh.inner_facets, mesh.inner_facets.shape[1])
+    for name, facets in sides.items():
+        nodes[f"{name} inside"] = (mesh.inner_facets[:, facets], len(facets))
+        nodes[f"{name} outside"] = (mesh.outer_facets[:, facets], len(facets))
+    layout, regions, pattern = build_pattern(supports(mesh, scene.mesh), nodes)
+    marks = find_landmarks(mesh, scene.mesh, tuple(layer.name for layer in scene.artery.layers))
+    stencils, layout, regions = jax.tree_util.tree_map(jnp.asarray, (stencils, layout, regions))
+    return Discretisation(
+        mesh=mesh, stencils=stencils, layout=layout, regions=regions, sides=sides, marks=marks
+    ), pattern
 
 
-def body_of(scene: Scene, discretisation: Discretisation) -> Body:
-    """The body of a scene; a JAX function of every float in it."""
-    parameters = Parameters(
-        materials=tuple(layer.material for layer in scene.artery.layers),
-        contact=scene.contact,
-        jaw=scene.clamp.jaw,
-    )
-    return Body(
-        topology=discretisation.topology,
-        stencils=discretisation.stencils,
-        geometry=build_geometry(discretisation.mesh, scene.mesh, scene.artery),
-        parameters=parameters,
-    )
+def _sides(mesh: Mesh, settings: MeshSettings) -> dict[str, np.ndarray]:
+    """Facets of the upper half and, where it is modelled, of the lower one."""
+    first, last = symmetry_of(settings.symmetry).quarters
+    quarter = first + np.arange((last - first) * settings.circumferential) // settings.circumferential
+    around = np.tile(quarter, mesh.inner_facets.shape[1] // len(quarter))
+    upper = np.isin(around, (0, 1))
+    found = {"upper": np.flatnonzero(upper), "lower": np.flatnonzero(~upper)}
+    return {name: facets for name, facets in found.items() if len(facets)}
+
+
+def potential_of(scene: Scene, discretisation: Discretisation) -> Potential:
+    """The potential of a scene with all its terms; a JAX function of every float in it."""
+    d = discretisation
+    terms = _terms(scene.artery, scene.clamp, scene.contact, scene.mesh, d)
+    return build_potential(terms, d.regions, d.stencils, d.layout)
+
+
+@jax.jit
+def _terms(
+    artery: Artery, clamp: Clamp, contact: Contact, settings: MeshSettings, d: Discretisation
+) -> tuple[Term | Volume, ...]:
+    body = tube_body(d.mesh, d.stencils, settings, artery)
+    return all_terms(Made(artery, clamp, contact, body, d.stencils, d.sides))
+
+
+def positions(scene: Scene, discretisation: Discretisation, free: Array) -> Array:
+    """Positions of all nodes, mm, (n_nodes, 3): the free ones (n_free,), the planes and the moved ends."""
+    mesh, layout = discretisation.mesh, discretisation.layout
+    end = end_height(scene.artery, scene.artery.axial_stretch)
+    held = jnp.zeros((layout.n_nodes, 3))
+    for line in end_lines(scene.mesh):
+        held = held.at[mesh.plane(2, line), 2].set(end if line == -1 else -end)
+    return held.ravel().at[layout.free].set(free).reshape(layout.n_nodes, 3)
 
 
 def build_model(scene: Scene, like: Model | None = None) -> Model:
@@ -92,87 +146,10 @@ def build_model(scene: Scene, like: Model | None = None) -> Model:
         discretisation, pattern = discretise(scene)
     # float64 arrays, as in derivatives: Python's floats would make JAX compile everything once more
     floats = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, jnp.float64), scene)
-    return Model(scene, discretisation, pattern, body_of(floats, discretisation))
+    return Model(scene, discretisation, pattern, potential_of(floats, discretisation))
 
 
 def same_kind(a: Scene, b: Scene) -> bool:
     """True if two scenes differ in floats, title and solver settings only."""
     kinds = [shape_of(dataclasses.replace(s, title="", solver=a.solver), np.shape) for s in (a, b)]
     return bool(kinds[0] == kinds[1])
-
-
-def terms(scene: Scene) -> dict[str, str]:
-    """The energy terms of the model and why each is there."""
-    found = {
-        f"wall: {layer.name}": f"layer with law '{layer.material.law}', stress-free as an open sector "
-        "(residual stress needs no further term)"
-        for layer in scene.artery.layers
-    }
-    found["incompressibility"] = (
-        "volume change averaged over each cell"
-        if scene.mesh.element == "q1p0"
-        else "pressure linear in each cell"
-    )
-    if float(scene.artery.pressure) != 0.0:
-        found["blood pressure"] = "follower load on the lumen, as enclosed volume"
-    found["lumen contact"] = "opposite inner walls meet in the plane of symmetry once the lumen closes"
-    found["jaw contact"] = f"rigid '{scene.clamp.jaw.shape}' jaw against the outer wall, frictionless"
-    return found
-
-
-USUAL_ITERATIONS = 90
-"""Newton iterations of a whole clamping, on any mesh"""
-START_SECONDS = 8.0
-"""compilation and output, s"""
-ITERATION_SECONDS, ITERATION_EXPONENT = 8.2e-7, 1.33
-"""time of an iteration: factor times unknowns to the exponent, s (fitted to two meshes)"""
-START_MEMORY, MEMORY_PER_UNKNOWN = 500.0, 0.025
-"""MB: Python with the compiled programs, and what the factors add (the same two meshes)"""
-
-
-def describe(scene: Scene) -> dict[str, Any]:
-    """What would be modelled, and what it would cost; solves nothing."""
-    mesh = build_mesh(scene.mesh)
-    unknowns = 3 * mesh.n_nodes - int(supported(mesh).sum())
-    return {
-        "symmetry": SYMMETRY,
-        "layers": {
-            layer.name: f"{layer.material.law}, {count} elements through the thickness"
-            for layer, count in zip(scene.artery.layers, scene.mesh.radial, strict=True)
-        },
-        "terms": terms(scene),
-        "element": scene.mesh.element,
-        "elements": mesh.n_cells,
-        "unknowns": unknowns,
-        "stop": scene.stop.kind,
-        "continuation": scene.solver.continuation,
-        "linear_solver": available(unknowns)[0]
-        if scene.solver.linear_solver == "auto"
-        else scene.solver.linear_solver,
-        "predicted_seconds": _rounded(
-            START_SECONDS + USUAL_ITERATIONS * ITERATION_SECONDS * unknowns**ITERATION_EXPONENT
-        ),
-        "predicted_memory_MB": _rounded(START_MEMORY + MEMORY_PER_UNKNOWN * unknowns),
-        "warnings": warnings(scene, mesh),
-    }
-
-
-def _rounded(estimate: float) -> float:
-    """Two significant digits: it is no more than an estimate."""
-    return float(f"{estimate:.2g}")
-
-
-def warnings(scene: Scene, mesh: Mesh) -> list[str]:
-    """What the mesh cannot resolve."""
-    heights = 0.5 * float(scene.artery.length) * np.asarray(axial_fractions(mesh, scene.mesh))
-    jaw = scene.clamp.jaw
-    under = heights[:-1] <= float(jaw.half_extent())
-    widest = float(np.max(np.diff(heights)[under])) * float(scene.artery.axial_stretch)
-    radius = float(jaw.least_radius())
-    if widest > radius:
-        return [
-            f"the jaw's least radius of curvature is {radius:.3g} mm, and the facets under it are up to "
-            f"{widest:.3g} mm long: stress at its edges is not resolved "
-            "(use more axial elements, or a larger radius)"
-        ]
-    return []

@@ -1,56 +1,36 @@
 """From densities at points to residual and sparse tangent.
 
-A density is a pointwise scalar of n_c vectors y_c = sum_a S[q, c, a] x_a (tangents, or a position).
-Its first and second derivatives with respect to y come from autodiff; the stencil S is the same
-for every cell, so that the contraction to cell vectors and matrices is one product with a
-constant matrix. Cell matrices are kept as the six component pairs (xx, yy, zz, xy, xz, yz) over
-all pairs of nodes.
+A density is a pointwise scalar of n_c vectors y_c = sum_a S[q, c, a] x_a (tangents, or a position) and,
+where rigid things move, of the rigid coordinates. Its first and second derivatives with respect to both
+come from autodiff; the stencil S is the same for every cell, so that the contraction to cell vectors and
+matrices is one product with a constant matrix. Cell matrices are kept as the six component pairs (xx, yy,
+zz, xy, xz, yz) over all pairs of nodes. One program serves every piece of one kind and size.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxclamp.core.records import record, static
-from jaxclamp.core.tensors import Tensor, components, det, pointwise_derivatives, stacked, total
-from jaxclamp.fem.elements import tensor_rule
-from jaxclamp.fem.tube import Mesh
-from jaxclamp.physics.materials import Material
-from jaxclamp.potential.densities import (
-    Geometry,
-    Parameters,
-    Stencils,
-    contact_density,
-    dilatation_density,
-    intima_density,
-    jaw_gap,
-    lumen_density,
-    wall_density,
+from jaxclamp.core.tensors import Tensor, det, pointwise_derivatives, stacked, total
+from jaxclamp.fem.pattern import PAIRS, Layout
+from jaxclamp.potential.densities import RIGID, Density, Solid, dilatation, pressure_work
+from jaxclamp.potential.energy import (
+    AnyArray,
+    State,
+    at_points,
+    cell_pressures,
+    condensed_pressures,
+    dilatations,
+    gather,
+    group_points,
 )
-
-PAIRS = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
-
-AnyArray = Array | np.ndarray
-Density = Callable[[Tensor], Array]
-
-
-def at_points(stencil: AnyArray, x: Array) -> dict[tuple[int, int], Array]:
-    """y_c = sum_a S[q, c, a] x_a at every point, by components [c, i]: each (n_q, n_cells).
-
-    stencil: (n_q, n_c, n_en); x: positions of the cells' nodes, (n_en, 3, n_cells)
-    """
-    n_q, n_c, n_en = stencil.shape
-    y = jnp.matmul(jnp.reshape(stencil, (n_q * n_c, n_en)), x.reshape(n_en, -1))
-    return components(jnp.moveaxis(y.reshape(n_q, n_c, 3, -1), 0, 2))
+from jaxclamp.potential.terms import Group, Potential
 
 
 def to_nodes(stencil: AnyArray, dy: Array) -> Array:
@@ -71,140 +51,53 @@ def to_matrices(stencil: AnyArray, moduli: Array) -> Array:
     return (products @ jnp.moveaxis(moduli, 3, 0).reshape(products.shape[1], -1)).reshape(n_en, n_en, 6, -1)
 
 
-def cell_derivatives(density: Density, stencil: AnyArray, x: Array) -> tuple[Array, Array, Array]:
-    """Energy at the points (n_q, n_cells), cell vectors (n_en, 3, n_cells), cell matrices."""
-    n_c = stencil.shape[1]
-    y = at_points(stencil, x)
-    of_components = lambda v: density(dict(zip(y, v, strict=True)))  # noqa: E731
-    value, first, second = pointwise_derivatives(of_components, list(y.values()))
-    moduli = second.reshape(n_c, 3, n_c, 3, *value.shape)
-    six = jnp.stack([moduli[:, i, :, j] for i, j in PAIRS], axis=2)
-    return value, to_nodes(stencil, first.reshape(n_c, 3, *value.shape)), to_matrices(stencil, six)
-
-
 @record
-class Topology:
-    """Integers of the mesh and of the sparse pattern, passed to compiled functions as data."""
+class Pressures:
+    """The pressures of some cells, and what they belong to."""
 
-    cells: np.ndarray
-    lumen_facets: np.ndarray
-    outer_facets: np.ndarray
-    slots: tuple[np.ndarray, ...]
-    """where the matrix entries of each block of cells, of the lumen and of the outer facets go in
-    the sparse values; the place behind the last one takes what belongs nowhere"""
-    free: np.ndarray
-    """degree of freedom 3 node + component of each unknown, (n_free,)"""
-    layer_cells: tuple[tuple[int, int], ...] = static()
-    """first and last-plus-one cell of each layer"""
-    blocks: tuple[tuple[int, int, int], ...] = static()
-    """layer, first and last-plus-one cell of each block"""
-    n_nonzeros: int = static()
-
-
-@dataclasses.dataclass(frozen=True)
-class Pattern:
-    """Upper triangle (with diagonal) of the symmetric tangent, by compressed rows."""
-
-    indptr: np.ndarray
-    indices: np.ndarray
-
-    @property
-    def n(self) -> int:
-        return len(self.indptr) - 1
-
-
-def supported(mesh: Mesh) -> np.ndarray:
-    """True for degrees of freedom held by symmetry planes and the planar end, (n_nodes, 3)."""
-    held = np.zeros((mesh.n_nodes, 3), dtype=bool)
-    held[mesh.compression_plane, 0] = True
-    held[mesh.fold_plane, 1] = True
-    held[mesh.clamp_plane, 2] = True
-    held[mesh.end_plane, 2] = True
-    return held
-
-
-POINTS_PER_BLOCK = 2400
-"""quadrature points differentiated together: their intermediate arrays then fit a core's cache"""
-
-
-def cut_into_blocks(
-    layer_cells: tuple[tuple[int, int], ...], points_per_cell: int
-) -> tuple[tuple[int, int, int], ...]:
-    """Blocks (layer, first cell, last + 1) of one size, a common divisor of the layers' counts.
-
-    One size means one compiled program; a block within a layer has one material.
-    """
-    common = math.gcd(*[last - first for first, last in layer_cells])
-    wanted = max(POINTS_PER_BLOCK // points_per_cell, 1)
-    size = max(d for d in range(1, min(wanted, common) + 1) if common % d == 0)
-    return tuple(
-        (layer, start, start + size)
-        for layer, (first, last) in enumerate(layer_cells)
-        for start in range(first, last, size)
-    )
-
-
-def build_topology(mesh: Mesh) -> tuple[Topology, Pattern]:
-    """Number the unknowns and find the place of every cell-matrix entry in the sparse tangent."""
-    free = np.flatnonzero(~supported(mesh).ravel())
-    unknown = np.full(3 * mesh.n_nodes, -1)
-    unknown[free] = np.arange(len(free))
-    n = len(free)
-
-    def keys(nodes: np.ndarray) -> np.ndarray:
-        rows = unknown[3 * nodes[:, None, None, :] + PAIRS[:, 0][:, None]]
-        columns = unknown[3 * nodes[None, :, None, :] + PAIRS[:, 1][:, None]]
-        rows, columns = np.broadcast_arrays(rows, columns)
-        key = np.minimum(rows, columns) * np.int64(n) + np.maximum(rows, columns)
-        local = np.arange(len(nodes))
-        mirror = (local[:, None] > local[None])[:, :, None] & (PAIRS[:, 0] == PAIRS[:, 1])
-        key[(rows < 0) | (columns < 0) | mirror[..., None]] = -1
-        return key.ravel()
-
-    blocks = cut_into_blocks(mesh.layer_cells, len(mesh.element.quadrature()[1]))
-    parts = [mesh.cells[:, first:last] for _, first, last in blocks] + [mesh.lumen_facets, mesh.outer_facets]
-    entries = [keys(nodes) for nodes in parts]
-    stacked = np.concatenate(entries)
-    distinct, place = np.unique(stacked, return_inverse=True)
-    skipped = int(distinct[0] == -1)
-    n_nonzeros = len(distinct) - skipped
-    slots = np.where(stacked < 0, n_nonzeros, place - skipped).astype(np.int32)
-    ends = np.cumsum([part.size for part in entries[:-1]])
-    rows, indices = np.divmod(distinct[skipped:], n)
-    indptr = np.searchsorted(rows, np.arange(n + 1))
-    topology = Topology(
-        cells=mesh.cells.astype(np.int32),
-        lumen_facets=mesh.lumen_facets.astype(np.int32),
-        outer_facets=mesh.outer_facets.astype(np.int32),
-        slots=tuple(np.split(slots, ends)),
-        free=free.astype(np.int32),
-        layer_cells=mesh.layer_cells,
-        blocks=blocks,
-        n_nonzeros=n_nonzeros,
-    )
-    return topology, Pattern(indptr.astype(np.int32), indices.astype(np.int32))
-
-
-@record
-class Body:
-    """Everything the compiled functions need about one scene, besides state and loads."""
-
-    topology: Topology
-    stencils: Stencils
-    geometry: Geometry
-    parameters: Parameters
-
-
-@record
-class State:
-    """A configuration: equilibrium or a trial."""
-
-    x: Array
-    """current position of the nodes, mm, (n_nodes, 3)"""
     p: Array
-    """pressure modes of the cells, kPa, (n_m, n_cells)"""
-    jaw_height: Array
-    """height of the jaw's lowest point above the axis, mm"""
+    """(n_m, n_cells)"""
+    modes: Array
+    """(n_m, n_q)"""
+    stiffness: Array
+    """M^-1, (n_m, n_m, n_cells)"""
+
+
+@record
+class Piece:
+    """The cells of one block of a group, cut out of potential and state; it knows no names."""
+
+    stencil: Array
+    x: Array
+    """current position of the nodes, mm, (n_en, 3, n_cells)"""
+    q: Array
+    densities: tuple[Density, ...] = static()
+    heres: tuple[Any, ...]
+    moved: bool = static()
+    pressures: Pressures | None
+
+
+@record
+class Linearised:
+    """A piece, linearised. What it does not have is None."""
+
+    energy: Array
+    """with the pressures at their best, uJ"""
+    force: Array
+    """d Pi/dx of the cells' nodes at the stored pressures, mN, (n_en, 3, n_cells)"""
+    matrix: Array
+    """condensed tangent, mN/mm, (n_en, n_en, 6, n_cells)"""
+    missing_force: Array | None = None
+    """what condensing the pressures adds to the force, mN, (n_en, 3, n_cells)"""
+    volume_error: Array | None = None
+    J_range: Array | None = None
+    """smallest and largest volume ratio, (2,)"""
+    rigid_slope: Array | None = None
+    """d Pi/dq, mN, (n_q,)"""
+    coupling: Array | None = None
+    """d2 Pi/dx dq, mN/mm, (n_q, n_en, 3, n_cells)"""
+    rigid_stiffness: Array | None = None
+    """d2 Pi/dq2, mN/mm, (n_q, n_q)"""
 
 
 @record
@@ -217,306 +110,229 @@ class Linearisation:
     """d Pi/dx of the free degrees of freedom, pressures condensed, mN, (n_free,)"""
     imbalance: Array
     """norm of the free forces at the *stored* pressures, mN: what a trial state is judged by, because
-    the condensed residual multiplies every change of volume that is of second order by the bulk modulus"""
+    a step changes the stored pressures to first order only"""
     reactions: Array
     """norm of the forces on the supports, mN"""
     volume_error: Array
-    """largest |mean J - 1 - p/bulk| of a cell"""
+    """largest |mean J - 1 - p / bulk| of a cell"""
     values: Array
-    """upper triangle of the condensed tangent, mN/mm, (n_nonzeros,)"""
-    jaw_force: Array
-    """-d Pi/d jaw_height of the modelled part (upward on the jaw is positive), mN"""
-    jaw_coupling: Array
-    """d2 Pi/dx d jaw_height, mN/mm, (n_free,)"""
-    jaw_stiffness: Array
-    """d2 Pi/d jaw_height**2, mN/mm"""
+    """condensed tangent in the order of the pattern, mN/mm, (n_nonzeros,)"""
+    rigid_force: Array
+    """-d Pi/dq: force on the modelled part of the jaws, mN, (n_q,)"""
+    coupling: Array
+    """d2 Pi/dx dq on the free degrees of freedom, mN/mm, (n_free, n_q)"""
+    rigid_stiffness: Array
+    """d2 Pi/dq2, mN/mm, (n_q, n_q)"""
     J_min: Array
     J_max: Array
 
-
-def _gather(x: Array, nodes: AnyArray) -> Array:
-    """Positions of the cells' nodes, (n_en, 3, n_cells)."""
-    return jnp.swapaxes(x[nodes], 1, 2)
-
-
-def _scatter(nodes: AnyArray, values: Array, n_nodes: int) -> Array:
-    """Sum of cell vectors (n_en, 3, n_cells) at the nodes, (n_nodes, 3)."""
-    return jnp.zeros((n_nodes, 3)).at[nodes].add(jnp.swapaxes(values, 1, 2))
+    @property
+    def jaw_force(self) -> Array:
+        """Force on the modelled part of the jaws, mN."""
+        return self.rigid_force[0]
 
 
-def _lumen(body: Body, pressure: Array | float) -> Density:
-    n = round(body.stencils.lumen.shape[0] ** 0.5)
-    weights = jnp.asarray(tensor_rule((n, n))[1])[:, None]
-    return lambda y: -pressure * lumen_density(y, weights)
-
-
-def _jaw(body: Body, jaw_height: Array) -> Density:
-    par = body.parameters
-    return lambda y: contact_density(y, jaw_height, par.jaw, par.contact, body.geometry.dA)
-
-
-def _intima(body: Body, plane: Array | float = 0.0) -> Density:
-    return lambda y: intima_density(y, plane, body.parameters.contact, body.geometry.dA_inner)
-
-
-def _dilatation(stencils: Stencils, geometry: Geometry, dx_dxi: Tensor) -> Array:
-    """int N_m (J - 1) dV of every cell, mm^3, (n_m, n_cells)."""
-    density = dilatation_density(dx_dxi, geometry.to_local, geometry.dV)
-    return jnp.einsum("mq,qc->mc", stencils.modes, density)
-
-
-def _condensed_pressure(geometry: Geometry, dilatation: Array) -> Array:
-    """The pressure in equilibrium with a dilatation: M^-1 int N_m (J - 1) dV, (n_m, n_cells)."""
-    return jnp.einsum("mnc,nc->mc", geometry.pressure_stiffness, dilatation)
-
-
-def potential(body: Body, x: Array, jaw_height: Array, pressure: Array) -> Array:
-    """Pi with the pressures at their best, uJ: a function of positions and loads alone."""
-    return artery_potential(body, x, pressure) + touch_potential(body, x, jaw_height)
-
-
-def artery_potential(body: Body, x: Array, pressure: Array) -> Array:
-    """The part of wall and blood, uJ."""
-    return stored_energy(body, x) - pressure * lumen_volume(body, x)
-
-
-def touch_potential(body: Body, x: Array, jaw_height: Array) -> Array:
-    """The part of all contact, uJ."""
-    return contact_potential(body, x, jaw_height) + intima_potential(body, x, 0.0)
-
-
-def stored_energy(body: Body, x: Array) -> Array:
-    """Strain energy of the wall of the modelled part, the pressures at their best, uJ."""
-    dx_dxi = at_points(body.stencils.wall, _gather(x, body.topology.cells))
-    geometry = body.geometry
-    wall = total(
-        _isochoric(
-            {key: values[:, first:last] for key, values in dx_dxi.items()},
-            geometry.to_local[..., first:last],
-            geometry.dV[:, first:last],
-            material,
-        )
-        for material, (first, last) in zip(body.parameters.materials, body.topology.layer_cells, strict=True)
-    )
-    return wall + _volumetric(body.stencils, geometry, dx_dxi)
-
-
-def _isochoric(dx_dxi: Tensor, to_local: Array, dV: Array, material: Material) -> Array:
-    return jnp.sum(wall_density(dx_dxi, to_local, dV, material, jnp.zeros(())))
-
-
-def _volumetric(stencils: Stencils, geometry: Geometry, dx_dxi: Tensor) -> Array:
-    dilatation = _dilatation(stencils, geometry, dx_dxi)
-    return 0.5 * jnp.sum(dilatation * _condensed_pressure(geometry, dilatation))
-
-
-def lumen_volume(body: Body, x: Array) -> Array:
-    """Volume of the modelled part of the lumen, mm^3."""
-    y = at_points(body.stencils.lumen, _gather(x, body.topology.lumen_facets))
-    return jnp.sum(_lumen(body, -1.0)(y))
-
-
-def contact_potential(body: Body, x: Array, jaw_height: Array) -> Array:
-    """The contact energy of the outer wall of the modelled part, uJ."""
-    y = at_points(body.stencils.contact, _gather(x, body.topology.outer_facets))
-    return jnp.sum(_jaw(body, jaw_height)(y))
-
-
-def intima_potential(body: Body, x: Array, plane: Array | float) -> Array:
-    """The contact energy of the inner wall of the modelled part against the plane y = `plane`, uJ."""
-    y = at_points(body.stencils.meeting, _gather(x, body.topology.lumen_facets))
-    return jnp.sum(_intima(body, plane)(y))
-
-
-@record
-class Block:
-    """Some cells of one layer, linearised."""
-
-    energy: Array
-    """wall energy with the pressures at their best, uJ"""
-    force: Array
-    """d Pi/dx of the cells' nodes at the stored pressures, mN, (n_en, 3, n_cells)"""
-    missing_force: Array
-    """what condensing the pressures adds to it, mN, (n_en, 3, n_cells)"""
-    matrix: Array
-    """condensed tangent, mN/mm, (n_en, n_en, 6, n_cells)"""
-    volume_error: Array
-    J_min: Array
-    J_max: Array
-
-
-@record
-class Piece:
-    """The cells of one block, cut out of body and state."""
-
-    x: Array
-    """current position of the nodes, mm, (n_en, 3, n_cells)"""
-    p: Array
-    """pressure modes, kPa, (n_m, n_cells)"""
-    geometry: Geometry
+# --- pieces -----------------------------------------------------------------------------------------
 
 
 @jax.jit
-def cut(body: Body, state: State) -> list[Piece]:
-    """Body and state cut into blocks.
+def cut(group: Group, state: State) -> list[Piece]:
+    """A group at a state cut into its blocks.
 
     A program of its own: slices inside the program that differentiates would keep it from being vectorised.
     """
-    return [piece(body, state, first, last) for _, first, last in body.topology.blocks]
+    return [piece(group, state, *block) for block in group.blocks]
 
 
-def piece(body: Body, state: State, first: int, last: int) -> Piece:
-    """The cells from `first` to before `last`."""
-    none = jnp.zeros((0, body.geometry.dV.shape[-1]))
-    g = replace(body.geometry, dA=none, dA_inner=none)
+def piece(group: Group, state: State, first: int, last: int) -> Piece:
+    """The cells of a group from `first` to before `last`."""
+    whole = (first, last) == (0, group.nodes.shape[1])
+    cells = lambda a: a if whole or jnp.ndim(a) < 2 else a[..., first:last]  # noqa: E731
+    part = lambda tree: jax.tree_util.tree_map(cells, tree)  # noqa: E731
+    pressures = None
+    if group.volume is not None:
+        assert group.modes is not None
+        start = group.volume.cells[0]
+        pressures = Pressures(
+            p=state.p[:, start + first : start + last],
+            modes=group.modes,
+            stiffness=part(group.volume.stiffness),
+        )
     return Piece(
-        x=_gather(state.x, body.topology.cells[:, first:last]),
-        p=state.p[:, first:last],
-        geometry=jax.tree_util.tree_map(lambda a: a[..., first:last], g),
+        stencil=group.stencil,
+        x=gather(state.x, group.nodes[:, first:last]),
+        q=state.q,
+        densities=tuple(term.density for term in group.terms),
+        heres=tuple(part(term.here) for term in group.terms),
+        moved=group.moved,
+        pressures=pressures,
     )
 
 
-def block_energy(piece: Piece, stencils: Stencils, material: Material) -> Array:
-    """Strain energy of the cells of a block, the pressures at their best, uJ."""
-    g = piece.geometry
-    dx_dxi = at_points(stencils.wall, piece.x)
-    return _isochoric(dx_dxi, g.to_local, g.dV, material) + _volumetric(stencils, g, dx_dxi)
+def piece_energy(piece: Piece, x: Array, heres: tuple[Any, ...], stiffness: Array) -> Array:
+    """Energy of a piece of the wall, the pressures at their best, uJ, with other positions and data."""
+    assert piece.pressures is not None
+    y, solid = at_points(piece.stencil, x), heres[0]
+    D = dilatations(piece.pressures.modes, solid, y)
+    points = total(
+        jnp.sum(density(y, piece.q, here)) for density, here in zip(piece.densities, heres, strict=True)
+    )
+    return points + 0.5 * jnp.sum(D * condensed_pressures(stiffness, D))
 
 
 @jax.jit
-def linearise_block(piece: Piece, stencils: Stencils, material: Material) -> Block:
-    """Energy, forces and condensed tangent of the cells of a block.
+def linearise_piece(piece: Piece) -> Linearised:
+    """Energy, forces and condensed tangent of the cells of a piece.
 
-    The tangent uses the *stored* pressures in its geometric part and eliminates their increments
-    cell by cell: K = K_xx(p) + G M^-1 G', residual = d Psi/dx + G M^-1 int N (J - 1). With p
-    updated along the step (`advance`) this is Newton's method on (x, p).
+    Where cells keep their volume, the tangent uses the *stored* pressures in its geometric part and
+    eliminates their increments cell by cell: K = K_xx(p) + G M^-1 G', residual = d Psi/dx +
+    G M^-1 int N (J - 1). With p updated along the step (`advance`) this is Newton's method on (x, p).
     """
-    x, p, g = piece.x, piece.p, piece.geometry
-    at_point = jnp.einsum("mq,mc->qc", stencils.modes, p)
-    density = partial(wall_density, to_local=g.to_local, dV=g.dV, material=material, p=at_point)
-    energies, force, matrix = cell_derivatives(density, stencils.wall, x)
+    y = at_points(piece.stencil, piece.x)
+    names, shape, n_c = list(y), y[0, 0].shape, piece.stencil.shape[1]
+    moving = [jnp.broadcast_to(q, shape) for q in piece.q] if piece.moved else []
 
-    # pressures: force of each mode, and what is missing to p = M^-1 int N (J - 1)
-    dx_dxi = at_points(stencils.wall, x)
-    dilatation = _dilatation(stencils, g, dx_dxi)
-    missing = _condensed_pressure(g, dilatation) - p
-    slope = stacked(jax.grad(lambda y: jnp.sum(dilatation_density(y, g.to_local, g.dV)))(dx_dxi))
-    modes = [to_nodes(stencils.wall, slope * mode[:, None]) for mode in stencils.modes]
-    stiff_modes = [
-        total(g.pressure_stiffness[m, n] * mode for n, mode in enumerate(modes)) for m in range(len(modes))
-    ]
-    missing_force = total(mode * missing[m] for m, mode in enumerate(modes))
-    matrix = matrix + total(
+    def density(v: list[Array]) -> Array:
+        at, q = dict(zip(names, v[: len(names)], strict=True)), v[len(names) :] or piece.q
+        known = zip(piece.densities, piece.heres, strict=True)
+        terms = [one(at, q, here) for one, here in known]
+        if piece.pressures is not None:
+            terms.append(pressure_work(at, _interpolated(piece.pressures), piece.heres[0]))
+        return total(terms)
+
+    value, first, second = pointwise_derivatives(density, [*y.values(), *moving])
+    n_y = len(names)
+    moduli = second[:n_y, :n_y].reshape(n_c, 3, n_c, 3, *shape)
+    six = jnp.stack([moduli[:, i, :, j] for i, j in PAIRS], axis=2)
+    found: dict[str, Any] = {
+        "energy": jnp.sum(value),
+        "force": to_nodes(piece.stencil, first[:n_y].reshape(n_c, 3, *shape)),
+        "matrix": to_matrices(piece.stencil, six),
+    }
+    if piece.moved:
+        mixed = second[n_y:, :n_y].reshape(len(moving), n_c, 3, *shape)
+        found["rigid_slope"] = jnp.sum(first[n_y:], axis=(1, 2))
+        found["coupling"] = jnp.stack([to_nodes(piece.stencil, part) for part in mixed])
+        found["rigid_stiffness"] = jnp.sum(second[n_y:, n_y:], axis=(2, 3))
+    if piece.pressures is not None:
+        found |= _condensed(piece.pressures, piece.heres[0], piece.stencil, y, found)
+    return Linearised(**found)
+
+
+def _interpolated(pressures: Pressures) -> Array:
+    """Pressure at the points, (n_q, n_cells)."""
+    return jnp.einsum("mq,mc->qc", pressures.modes, pressures.p)
+
+
+def _condensed(
+    pressures: Pressures, solid: Solid, stencil: Array, y: Tensor, found: dict[str, Any]
+) -> dict[str, Any]:
+    """What eliminating the pressures of the cells changes and adds."""
+    p, modes, stiffness = pressures.p, pressures.modes, pressures.stiffness
+    D = dilatations(modes, solid, y)
+    missing = condensed_pressures(stiffness, D) - p  # to p = M^-1 int N (J - 1)
+    slope = stacked(jax.grad(lambda v: jnp.sum(dilatation(v, solid)))(y))
+    by_mode = [to_nodes(stencil, slope * mode[:, None]) for mode in modes]
+    stiff = [total(stiffness[m, n] * mode for n, mode in enumerate(by_mode)) for m in range(len(by_mode))]
+    added = total(
         jnp.stack([a[:, None, i] * b[None, :, j] for i, j in PAIRS], axis=2)
-        for a, b in zip(modes, stiff_modes, strict=True)
+        for a, b in zip(by_mode, stiff, strict=True)
     )
-    # potential with p eliminated: replace int p (J - 1) by 1/2 D' M^-1 D
-    volumetric = 0.5 * jnp.sum(dilatation * (missing + p)) - jnp.sum(p * dilatation)
-    J = det(dx_dxi) * det(g.to_local)
-    compliance = 1.0 / (g.pressure_stiffness[0, 0] * jnp.sum(g.dV, axis=0))
-    return Block(
-        energy=jnp.sum(energies) + volumetric,
-        force=force,
-        missing_force=missing_force,
-        matrix=matrix,
-        volume_error=jnp.max(jnp.abs(jnp.einsum("mq,mc->qc", stencils.modes, missing)) * compliance),
+    J = det(y) * det(solid.to_local)
+    compliance = 1.0 / (stiffness[0, 0] * jnp.sum(solid.dV, axis=0))
+    return {
+        # potential with p eliminated: replace int p (J - 1) by 1/2 D' M^-1 D
+        "energy": found["energy"] + 0.5 * jnp.sum(D * (missing + p)) - jnp.sum(p * D),
+        "matrix": found["matrix"] + added,
+        "missing_force": total(mode * missing[m] for m, mode in enumerate(by_mode)),
+        "volume_error": jnp.max(jnp.abs(jnp.einsum("mq,mc->qc", modes, missing)) * compliance),
+        "J_range": jnp.stack([jnp.min(J), jnp.max(J)]),
+    }
+
+
+# --- the whole --------------------------------------------------------------------------------------
+
+
+def linearise(potential: Potential, state: State) -> Linearisation:
+    """Forces and condensed tangent at a state, piece by piece."""
+    pieces = [[linearise_piece(one) for one in cut(group, state)] for group in potential.groups]
+    return assemble(potential, pieces)
+
+
+@jax.jit
+def assemble(potential: Potential, pieces: list[list[Linearised]]) -> Linearisation:
+    """Pieces summed into residual and tangent."""
+    layout = potential.layout
+    # one scatter per block: XLA's is many times slower on a concatenation
+    values = jnp.zeros(layout.n_nonzeros + 1)
+    force = jnp.zeros((layout.n_nodes, 3))
+    missing = jnp.zeros_like(force)
+    for group, blocks in zip(potential.groups, pieces, strict=True):
+        for (first, last), slots, block in zip(group.blocks, group.slots, blocks, strict=True):
+            nodes = group.nodes[:, first:last]
+            values = values.at[slots].add(block.matrix.ravel(), mode="promise_in_bounds")
+            force = _added(force, nodes, block.force)
+            if block.missing_force is not None:
+                missing = _added(missing, nodes, block.missing_force)
+    imbalance = jnp.linalg.norm(force.ravel()[layout.free])
+    force = (force + missing).ravel()
+    slope, coupling, stiffness = _rigid(potential, pieces)
+    every = [block for blocks in pieces for block in blocks]
+    J = jnp.stack([block.J_range for block in every if block.J_range is not None])
+    errors = [block.volume_error for block in every if block.volume_error is not None]
+    return Linearisation(
+        energy=total(block.energy for block in every),
+        residual=force[layout.free],
+        imbalance=imbalance,
+        reactions=jnp.linalg.norm(force.at[layout.free].set(0.0)),
+        volume_error=jnp.max(jnp.stack(errors)),
+        values=values[:-1],
+        rigid_force=-slope,
+        coupling=coupling,
+        rigid_stiffness=stiffness,
         J_min=jnp.min(J),
         J_max=jnp.max(J),
     )
 
 
-@jax.jit
-def artery_forces(body: Body, x: Array, pressure: Array) -> Array:
-    """d Pi/dx of wall and blood without contact, mN, (n_nodes, 3): what `linearise` gives without the
-    tangent, in one program that is cheap to differentiate."""
-    forces: Array = jax.grad(artery_potential, argnums=1)(body, x, pressure)
-    return forces
+def _added(field: Array, nodes: AnyArray, cells: Array) -> Array:
+    """A field (n_nodes, 3) with what cells have at their nodes (n_en, 3, n_cells) added."""
+    return field.at[nodes].add(jnp.swapaxes(cells, 1, 2))
+
+
+def _rigid(potential: Potential, pieces: list[list[Linearised]]) -> tuple[Array, Array, Array]:
+    """Derivatives of Pi by q: slope (n_q,), coupling with the unknowns (n_free, n_q), stiffness."""
+    layout, n_q = potential.layout, len(RIGID)
+    slope, stiffness = jnp.zeros(n_q), jnp.zeros((n_q, n_q))
+    mixed = [jnp.zeros((layout.n_nodes, 3)) for _ in range(n_q)]
+    for group, blocks in zip(potential.groups, pieces, strict=True):
+        for (first, last), block in zip(group.blocks, blocks, strict=True):
+            if block.coupling is None:
+                continue
+            slope, stiffness = slope + block.rigid_slope, stiffness + block.rigid_stiffness
+            nodes = group.nodes[:, first:last]
+            mixed = [_added(field, nodes, part) for field, part in zip(mixed, block.coupling, strict=True)]
+    return slope, jnp.stack([field.ravel()[layout.free] for field in mixed], axis=1), stiffness
+
+
+def on_nodes(layout: Layout, v: Array) -> Array:
+    """Unknowns (n_free,) as a field (n_nodes, 3), zero where nodes are held."""
+    return jnp.zeros(3 * layout.n_nodes).at[layout.free].set(v).reshape(layout.n_nodes, 3)
 
 
 @jax.jit
-def contact_forces(body: Body, x: Array, jaw_height: Array) -> tuple[Array, Array]:
-    """d Pi/dx of all contact, mN, (n_nodes, 3), and d Pi/d jaw_height, mN."""
-    slopes: tuple[Array, Array] = jax.grad(touch_potential, argnums=(1, 2))(body, x, jaw_height)
-    return slopes
+def advance(potential: Potential, state: State, dx: Array, dq: Array, fraction: Array) -> State:
+    """Go a fraction of the Newton step: free unknowns dx (n_free,), dq (n_q,), and condensed pressures."""
+    step = on_nodes(potential.layout, dx)
 
+    def condensed(group: Group) -> Array:
+        assert group.volume is not None
+        assert group.modes is not None
+        D: Callable[[Array], Array] = lambda x: dilatations(  # noqa: E731
+            group.modes, group.terms[0].here, group_points(group, x)
+        )
+        now, change = jax.jvp(D, (state.x,), (step,))
+        return condensed_pressures(group.volume.stiffness, now + change)
 
-@jax.jit
-def assemble(body: Body, state: State, pressure: Array, blocks: list[Block]) -> Linearisation:
-    """Blood pressure, contact, and the blocks of the wall, summed into residual and tangent."""
-    top, st = body.topology, body.stencils
-    x, n_nodes = state.x, state.x.shape[0]
-    lumen_e, lumen_f, lumen_k = cell_derivatives(
-        _lumen(body, pressure), st.lumen, _gather(x, top.lumen_facets)
-    )
-    meet_e, meet_f, meet_k = cell_derivatives(_intima(body), st.meeting, _gather(x, top.lumen_facets))
-    jaw_e, jaw_f, jaw_k = cell_derivatives(
-        _jaw(body, state.jaw_height), st.contact, _gather(x, top.outer_facets)
-    )
-    # one scatter per block: XLA's is many times slower on a concatenation
-    values = jnp.zeros(top.n_nonzeros + 1)
-    for slots, matrix in zip(top.slots, [*[b.matrix for b in blocks], lumen_k + meet_k, jaw_k], strict=True):
-        values = values.at[slots].add(matrix.ravel(), mode="promise_in_bounds")
-    inner = _scatter(top.lumen_facets, lumen_f + meet_f, n_nodes)
-    force = inner + _scatter(top.outer_facets, jaw_f, n_nodes)
-    missing = jnp.zeros_like(force)
-    for (_, first, last), block in zip(top.blocks, blocks, strict=True):
-        force = force + _scatter(top.cells[:, first:last], block.force, n_nodes)
-        missing = missing + _scatter(top.cells[:, first:last], block.missing_force, n_nodes)
-    imbalance = jnp.linalg.norm(force.ravel()[top.free])
-    force = (force + missing).ravel()
-
-    slope_of_height = lambda d: jax.grad(contact_potential, argnums=(1, 2))(body, x, d)  # noqa: E731
-    (_, along_height), (coupling, stiffness) = jax.jvp(
-        slope_of_height, (state.jaw_height,), (jnp.ones_like(state.jaw_height),)
-    )
-    return Linearisation(
-        energy=total(b.energy for b in blocks) + jnp.sum(lumen_e) + jnp.sum(meet_e) + jnp.sum(jaw_e),
-        residual=force[top.free],
-        imbalance=imbalance,
-        reactions=jnp.linalg.norm(force.at[top.free].set(0.0)),
-        volume_error=jnp.max(jnp.stack([b.volume_error for b in blocks])),
-        values=values[:-1],
-        jaw_force=-along_height,
-        jaw_coupling=coupling.ravel()[top.free],
-        jaw_stiffness=stiffness,
-        J_min=jnp.min(jnp.stack([b.J_min for b in blocks])),
-        J_max=jnp.max(jnp.stack([b.J_max for b in blocks])),
-    )
-
-
-def linearise(body: Body, state: State, pressure: Array | float) -> Linearisation:
-    """Forces and condensed tangent at a state, block by block."""
-    materials = [body.parameters.materials[layer] for layer, _, _ in body.topology.blocks]
-    pieces = cut(body, state)
-    blocks = [linearise_block(p, body.stencils, m) for p, m in zip(pieces, materials, strict=True)]
-    return assemble(body, state, pressure, blocks)
-
-
-@jax.jit
-def advance(body: Body, state: State, dx: Array, d_height: Array, fraction: Array) -> State:
-    """Go a fraction of the Newton step: free unknowns dx (n_free,), jaw, and condensed pressures."""
-    step = jnp.zeros(state.x.size).at[body.topology.free].set(dx).reshape(state.x.shape)
-    dilate = lambda x: _dilatation(  # noqa: E731
-        body.stencils, body.geometry, at_points(body.stencils.wall, _gather(x, body.topology.cells))
-    )
-    dilatation, change = jax.jvp(dilate, (state.x,), (step,))
-    dp = _condensed_pressure(body.geometry, dilatation + change) - state.p
-    return State(
-        x=state.x + fraction * step,
-        p=state.p + fraction * dp,
-        jaw_height=state.jaw_height + fraction * d_height,
-    )
-
-
-@jax.jit
-def with_equilibrium_pressure(body: Body, x: Array, jaw_height: Array) -> State:
-    """A state whose pressures fit its dilatation: p = M^-1 int N (J - 1) dV."""
-    y = at_points(body.stencils.wall, _gather(x, body.topology.cells))
-    p = _condensed_pressure(body.geometry, _dilatation(body.stencils, body.geometry, y))
-    return State(x=x, p=p, jaw_height=jaw_height)
-
-
-def gaps(body: Body, state: State) -> Array:
-    """Gap at the contact points, mm, (n_cq, n_facets)."""
-    y = at_points(body.stencils.contact, _gather(state.x, body.topology.outer_facets))
-    return jaw_gap([y[0, i] for i in range(3)], state.jaw_height, body.parameters.jaw)
+    dp = cell_pressures(potential, condensed) - state.p
+    return State(x=state.x + fraction * step, p=state.p + fraction * dp, q=state.q + fraction * dq)

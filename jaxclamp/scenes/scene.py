@@ -9,7 +9,8 @@ values. A field annotated `Array` holds one number unless it says otherwise.
 from __future__ import annotations
 
 import abc
-from typing import ClassVar
+import dataclasses
+from typing import Any, ClassVar, cast
 
 from jax import Array
 
@@ -64,36 +65,25 @@ class Stop(abc.ABC):
     """
 
     CHOSEN_BY_KEY: ClassVar[bool] = True
+    STEADY: ClassVar[bool] = False
+    """the measure changes steadily from first contact on, so that closing can go in steps of it"""
 
     kind: str
     """what the stop is called in results"""
 
+    @abc.abstractmethod
+    def measure(self, equilibria: Any) -> Array:
+        """What is to reach the target, in internal units: a JAX function of `observe.equilibria.Equilibria`."""
 
-@record
-class OcclusionStop(Stop):
-    """Close until 1 - lumen height / physiological lumen diameter, at mid-length, is reached."""
+    def target(self) -> Array:
+        """The value at which closing ends: the record's only quantity."""
+        (field,) = (f for f in dataclasses.fields(cast(Any, self)) if "range" in f.metadata)
+        value: Array = getattr(self, field.name)
+        return value
 
-    kind: str = static("occlusion")
-    occlusion: Array = quantity("", 1e-4, 0.999)
-    """0: as in the body, 1: closed"""
-
-
-@record
-class TravelStop(Stop):
-    """Move each jaw by a given distance from its first contact."""
-
-    kind: str = static("travel")
-    travel: Array = quantity("mm", 0.0, 1e3)
-    """of one jaw"""
-
-
-@record
-class ForceStop(Stop):
-    """Close until the force on one jaw (whole artery) is reached."""
-
-    kind: str = static("force")
-    force: Array = quantity("N", 1e-6, 1e4)
-    """on one jaw; mN inside"""
+    def far_from_closure(self) -> bool:
+        """True if opposite inner walls surely do not meet on the way to the stop."""
+        return False
 
 
 @record

@@ -1,10 +1,10 @@
 """How equilibrium is differentiated: the implicit function theorem at the converged states.
 
-The unknowns u are the free positions of the physiological state, those at the stop, and the jaw's
-height; pressures are eliminated. They solve, for a scene s,
+The unknowns u are the free positions of the physiological state, those at the stop, and the rigid
+coordinates q; pressures are eliminated. They solve, for a scene s,
 
     R_0(u_0, s) = d Pi/dx without contact = 0                  in the body
-    R_1(u_1, h, s) = d Pi/dx = 0,  S(u_0, u_1, h, s) = 0       at the stop (bordered)
+    R_1(u_1, q, s) = d Pi/dx = 0,  S(u_0, u_1, q, s) = 0       at the stop (bordered)
 
 so that du = -(dR/du)^-1 dR/ds ds. `implicit` is the identity on u with exactly this derivative,
 as a JAX function of any order: its linear solve runs on the host with the factors that the
@@ -30,16 +30,18 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
 from jaxclamp.core.records import record
-from jaxclamp.observe.measures import Measure, Seen
-from jaxclamp.observe.stresses import PARTS_OF_A_JAW, Landmarks
-from jaxclamp.potential.model import Discretisation, body_of, discretise
-from jaxclamp.potential.tangent import Body, State, artery_forces, contact_forces, with_equilibrium_pressure
-from jaxclamp.scenes.scene import OcclusionStop, Scene, Stop, TravelStop
+from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.measures import Measure
+from jaxclamp.potential.densities import RIGID
+from jaxclamp.potential.energy import State, energy, settled
+from jaxclamp.potential.model import Discretisation, discretise, positions, potential_of
+from jaxclamp.potential.terms import Potential
+from jaxclamp.scenes.scene import Scene, Stop
 from jaxclamp.sensitivity.worker import call_elsewhere
 from jaxclamp.solve.clamping import clamp, inflate
 from jaxclamp.solve.linear_solvers import LinearSolver
-from jaxclamp.solve.newton import Equilibrium
 from jaxclamp.solve.results import LinearSolvers, Result
+from jaxclamp.solve.stops import stop_residual, stop_row
 
 
 @record
@@ -50,74 +52,67 @@ class Unknowns:
     """free positions in the body, mm, (n_free,); None where they are held"""
     stop: Array | None
     """free positions at the stop, mm, (n_free,); None where nothing at the stop is asked for"""
-    jaw_height: Array | None
-    """at the stop, mm"""
+    q: Array | None
+    """rigid coordinates at the stop, mm, (n_q,)"""
 
 
-def positions(scene: Scene, parts: Discretisation, free: Array) -> Array:
-    """Positions of all nodes, mm, (n_nodes, 3): the free ones, the symmetry planes and the moved end."""
-    n_nodes = parts.mesh.n_nodes
-    end = 0.5 * scene.artery.length * scene.artery.axial_stretch
-    held = jnp.zeros((n_nodes, 3)).at[parts.mesh.end_plane, 2].set(end)
-    return held.ravel().at[parts.topology.free].set(free).reshape(n_nodes, 3)
+@jax.jit
+def artery_forces(potential: Potential, x: Array) -> Array:
+    """d Pi/dx of wall and blood on the unknowns, mN, (n_free,): what `linearise` gives without the
+    tangent, in one program that is cheap to differentiate."""
+    slope = jax.grad(energy, argnums=1)(potential.artery, x, jnp.zeros(0))
+    return slope.ravel()[potential.layout.free]
 
 
-def equations(scene: Scene, parts: Discretisation, u: Unknowns) -> Unknowns:
-    """Residuals of equilibrium and of the stop, mN and mm (mN for a force stop)."""
-    body, pressure, free = body_of(scene, parts), scene.artery.pressure, parts.topology.free
+@jax.jit
+def contact_forces(potential: Potential, x: Array, q: Array) -> tuple[Array, Array]:
+    """d Pi/dx of all contact on the unknowns, mN, (n_free,), and d Pi/dq, mN, (n_q,)."""
+    by_x, by_q = jax.grad(energy, argnums=(1, 2))(potential.clamp, x, q)
+    return by_x.ravel()[potential.layout.free], by_q
+
+
+def equations(scene: Scene, d: Discretisation, u: Unknowns) -> Unknowns:
+    """Residuals of equilibrium and of the stop, mN and the stop's unit."""
     assert u.physiological is not None
-    x0 = positions(scene, parts, u.physiological)
-    at_rest = artery_forces(body, x0, pressure).ravel()[free]
-    if u.stop is None or u.jaw_height is None:
-        return Unknowns(physiological=at_rest, stop=None, jaw_height=None)
-    stopped = stop_equations(scene, parts, u)
-    return dataclasses.replace(stopped, physiological=at_rest)
+    at_rest = artery_forces(potential_of(scene, d), positions(scene, d, u.physiological))
+    if u.stop is None or u.q is None:
+        return Unknowns(physiological=at_rest, stop=None, q=None)
+    return dataclasses.replace(stop_equations(scene, d, u), physiological=at_rest)
 
 
-def stop_equations(scene: Scene, parts: Discretisation, u: Unknowns) -> Unknowns:
+def stop_equations(scene: Scene, d: Discretisation, u: Unknowns) -> Unknowns:
     """The same without the equilibrium in the body, which is held."""
-    body, pressure, free = body_of(scene, parts), scene.artery.pressure, parts.topology.free
     assert u.stop is not None
-    closed = artery_forces(body, positions(scene, parts, u.stop), pressure).ravel()[free]
-    jaw = jaw_equations(scene, parts, u)
+    closed = artery_forces(potential_of(scene, d), positions(scene, d, u.stop))
+    jaw = jaw_equations(scene, d, u)
     assert jaw.stop is not None
     return dataclasses.replace(jaw, stop=closed + jaw.stop)
 
 
-def closing_residual(
-    stop: Stop, marks: Landmarks, x0: Array, x1: Array, jaw_height: Array, lift: Array
-) -> Array:
-    """Residual of the stop, mm (mN for a force stop); x0: in the body, lift: d Pi/d jaw_height, mN."""
-    top, outer = marks.lumen_top, marks.outer_top
-    if isinstance(stop, OcclusionStop):
-        return x1[top, 1] - (1.0 - stop.occlusion) * x0[top, 1]
-    if isinstance(stop, TravelStop):
-        return jaw_height - (x0[outer, 1] - stop.travel)
-    return -lift - stop.force / PARTS_OF_A_JAW
-
-
 @jax.jit
 def _jaw_equations(
-    body: Body, stop: Stop, parts: Discretisation, x0: Array, x1: Array, jaw_height: Array
+    potential: Potential, stop: Stop, d: Discretisation, x0: Array, x1: Array, q: Array
 ) -> tuple[Array, Array]:
-    """Contact forces on the free positions, mN, (n_free,), and the residual of the stop."""
-    touch, lift = contact_forces(body, x1, jaw_height)
-    closing = closing_residual(stop, parts.marks, x0, x1, jaw_height, lift)
-    return touch.ravel()[parts.topology.free], closing
+    """Contact forces on the unknowns, mN, (n_free,), and the residuals of q: of the stop, then of the
+    rigid coordinates that find their own equilibrium, (n_q,)."""
+    touch, by_q = contact_forces(potential, x1, q)
+    states = (settled(potential, x0, q), settled(potential, x1, q))
+    closing = stop_residual(stop, d.marks, potential, states)
+    return touch, by_q.at[0].set(closing)
 
 
-def jaw_equations(scene: Scene, parts: Discretisation, u: Unknowns) -> Unknowns:
+def jaw_equations(scene: Scene, d: Discretisation, u: Unknowns) -> Unknowns:
     """The part of `equations` in which jaw, contact and stop appear: the artery in the body is held."""
     assert u.physiological is not None
     assert u.stop is not None
-    assert u.jaw_height is not None
-    x0, x1 = positions(scene, parts, u.physiological), positions(scene, parts, u.stop)
-    touch, closing = _jaw_equations(body_of(scene, parts), scene.stop, parts, x0, x1, u.jaw_height)
-    return Unknowns(physiological=None, stop=touch, jaw_height=closing)
+    assert u.q is not None
+    x0, x1 = positions(scene, d, u.physiological), positions(scene, d, u.stop)
+    touch, closing = _jaw_equations(potential_of(scene, d), scene.stop, d, x0, x1, u.q)
+    return Unknowns(physiological=None, stop=touch, q=closing)
 
 
 @jax.custom_jvp
-def implicit(scene: Scene, parts: Discretisation, u: Unknowns, ticket: Array) -> Unknowns:
+def implicit(scene: Scene, d: Discretisation, u: Unknowns, ticket: Array) -> Unknowns:
     """The solution u of the equations, as a function of the scene with its true derivatives.
 
     ticket: number of the `Solution` whose factors solve the linear systems, see `register`
@@ -127,8 +122,8 @@ def implicit(scene: Scene, parts: Discretisation, u: Unknowns, ticket: Array) ->
 
 @partial(implicit.defjvp, symbolic_zeros=True)
 def _implicit_jvp(primals: Any, tangents: Any) -> tuple[Unknowns, Unknowns]:
-    scene, parts, u, ticket = primals
-    u = implicit(scene, parts, u, ticket)  # for derivatives of higher order
+    scene, d, u, ticket = primals
+    u = implicit(scene, d, u, ticket)  # for derivatives of higher order
     is_still = lambda t: isinstance(t, SymbolicZero)  # noqa: E731
     all_still = lambda tree: all(map(is_still, jax.tree_util.tree_leaves(tree, is_leaf=is_still)))  # noqa: E731
     moves, tree = jax.tree_util.tree_flatten(tangents[0], is_leaf=is_still)
@@ -144,7 +139,7 @@ def _implicit_jvp(primals: Any, tangents: Any) -> tuple[Unknowns, Unknowns]:
         for i, value in zip(active, values, strict=True):
             others[i] = value
         changed = jax.tree_util.tree_unflatten(tree, others)
-        return (equations if body_moves else jaw_equations)(changed, parts, u)
+        return (equations if body_moves else jaw_equations)(changed, d, u)
 
     active_moves = [moves[i] for i in active]
     _, slope = jax.jvp(residual, ([leaves[i] for i in active],), (active_moves,))
@@ -152,7 +147,7 @@ def _implicit_jvp(primals: Any, tangents: Any) -> tuple[Unknowns, Unknowns]:
     nothing = 0.0 * sum(jnp.sum(move) for move in active_moves)
     fixed = lax.stop_gradient(ticket)
     du = lax.custom_linear_solve(
-        partial(_tangent, scene, parts, u),
+        partial(_tangent, scene, d, u),
         jax.tree_util.tree_map(lambda r: nothing - r, slope),
         solve=lambda _, b: _on_host(fixed, b, transposed=False),
         transpose_solve=lambda _, b: _on_host(fixed, b, transposed=True),
@@ -161,14 +156,14 @@ def _implicit_jvp(primals: Any, tangents: Any) -> tuple[Unknowns, Unknowns]:
 
 
 @jax.jit
-def _tangent(scene: Scene, parts: Discretisation, u: Unknowns, v: Unknowns) -> Unknowns:
+def _tangent(scene: Scene, d: Discretisation, u: Unknowns, v: Unknowns) -> Unknowns:
     """dR/du v; where the artery in the body is held, without its equations."""
     if v.physiological is not None:
-        _, everywhere = jax.jvp(lambda w: equations(scene, parts, w), (u,), (v,))
+        _, everywhere = jax.jvp(lambda w: equations(scene, d, w), (u,), (v,))
         return everywhere
     held = lambda w: dataclasses.replace(w, physiological=u.physiological)  # noqa: E731
     start = dataclasses.replace(u, physiological=None)
-    _, at_stop = jax.jvp(lambda w: stop_equations(scene, parts, held(w)), (start,), (v,))
+    _, at_stop = jax.jvp(lambda w: stop_equations(scene, d, held(w)), (start,), (v,))
     return at_stop
 
 
@@ -191,41 +186,57 @@ class Solution:
     tangents: tuple[np.ndarray, np.ndarray | None]
     """values of K_0 and K_1, mN/mm"""
     responses: np.ndarray
-    """K_1^-1 times the coupling of positions and jaw height, (n_free,)"""
+    """K_1^-1 times the coupling of positions and rigid coordinates, (n_free, n_q)"""
     coupling: np.ndarray
-    """d2 Pi/dx d jaw_height at the stop, mN/mm, (n_free,)"""
-    rows: tuple[np.ndarray, np.ndarray, float]
-    """derivatives of the stop's equation by the positions in the body and at the stop, and by the height"""
+    """d2 Pi/dx dq at the stop, mN/mm, (n_free, n_q)"""
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """derivatives of the equations of q by the positions in the body and at the stop, (n_q, n_free) each,
+    and by q, (n_q, n_q)"""
 
 
 def solution(result: Result, to_stop: bool) -> Solution:
     """The solution that a result holds. Raises its EquilibriumError if it did not reach the stop."""
     result.require(to_stop)
-    free = np.asarray(result.model.discretisation.topology.free)
+    free = np.asarray(result.model.discretisation.layout.free)
     assert result.physiological is not None
     base, last = result.physiological.equilibrium, result.states[-1].equilibrium
     at = lambda state: np.asarray(state.x).reshape(-1)[free]  # noqa: E731
-    height: Any = np.asarray(last.state.jaw_height) if to_stop else None
-    u = Unknowns(physiological=at(base.state), stop=at(last.state) if to_stop else None, jaw_height=height)
+    q: Any = np.asarray(last.state.q) if to_stop else None
+    u = Unknowns(physiological=at(base.state), stop=at(last.state) if to_stop else None, q=q)
+    coupling = np.asarray(last.lin.coupling)
+    n_q, n = coupling.shape[::-1]
     return Solution(
         u=u,
         solvers=result.linear_solvers,
         tangents=(np.asarray(base.lin.values), np.asarray(last.lin.values) if to_stop else None),
-        responses=-last.responses[:, 1],
-        coupling=np.asarray(last.lin.jaw_coupling),
-        rows=_closing_row(result, last, free),
+        responses=-last.responses[:, 1:],
+        coupling=coupling,
+        rows=_rows_of_q(result) if to_stop else (np.zeros((n_q, n)), np.zeros((n_q, n)), np.eye(n_q)),
     )
 
 
-def _closing_row(result: Result, last: Equilibrium, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    stop, marks = result.scene.stop, result.model.marks
-    unit = lambda node: (free == 3 * node + 1).astype(float)  # noqa: E731
-    none = np.zeros(len(free))
-    if isinstance(stop, OcclusionStop):
-        return -(1.0 - float(stop.occlusion)) * unit(marks.lumen_top), unit(marks.lumen_top), 0.0
-    if isinstance(stop, TravelStop):
-        return -unit(marks.outer_top), none, 1.0
-    return none, -np.asarray(last.lin.jaw_coupling), -float(last.lin.jaw_stiffness)
+def _rows_of_q(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The stop's row, and below it those of the rigid coordinates that find their own equilibrium."""
+    e, lin = result.equilibria, result.states[-1].equilibrium.lin
+    by_body, (_, by_stop, by_q) = jax.device_get(
+        (_by_body(result.scene.stop, e), stop_row(result.scene.stop, e))
+    )
+    others = np.asarray(lin.coupling).T[1:]
+    return (
+        np.vstack([by_body, np.zeros_like(others)]),
+        np.vstack([by_stop, others]),
+        np.vstack([by_q, np.asarray(lin.rigid_stiffness)[1:]]),
+    )
+
+
+@jax.jit
+def _by_body(stop: Stop, e: Equilibria) -> Array:
+    """Derivative of a stop's measure by the unknowns in the body, (n_free,)."""
+
+    def of(x: Array) -> Array:
+        return stop.measure(dataclasses.replace(e, states=(settled(e.potential, x, e.body.q), e.last)))
+
+    return jax.grad(of)(e.body.x).ravel()[e.potential.layout.free]
 
 
 _solutions: OrderedDict[int, Solution] = OrderedDict()
@@ -253,34 +264,29 @@ def _solve(ticket: Any, b: Unknowns, *, transposed: bool) -> Unknowns:
 
 def solve_linear(known: Solution, b: Unknowns, *, transposed: bool) -> Unknowns:
     """Solve A z = b or A' z = b, A = dR/du, for right-hand sides with any batch axes in front."""
-    n = len(known.coupling)
-    columns = lambda a: np.asarray(a).reshape(-1, n).T  # noqa: E731  (n, n_rhs)
+    n, n_q = known.coupling.shape
+    columns = lambda a, size=n: np.asarray(a).reshape(-1, size).T  # noqa: E731  (size, n_rhs)
     solve_0 = lambda b: _solve_columns(known.solvers.holding(known.tangents[0]), b)  # noqa: E731
     held = b.physiological is None
     if b.stop is None:
-        return Unknowns(
-            physiological=_rows(solve_0(columns(b.physiological)), b.physiological),
-            stop=None,
-            jaw_height=None,
-        )
-    assert b.jaw_height is not None
+        x0 = _rows(solve_0(columns(b.physiological)), b.physiological)
+        return Unknowns(physiological=x0, stop=None, q=None)
     solve_1 = lambda b: _solve_columns(known.solvers.stop, b, known.tangents[1])  # noqa: E731
-    b1, bh = columns(b.stop), np.asarray(b.jaw_height).reshape(-1)
-    b0 = np.zeros((n, bh.size)) if held else columns(b.physiological)
-    by_body, by_stop, by_jaw = known.rows
+    b1, bq = columns(b.stop), columns(b.q, n_q)
+    b0 = np.zeros((n, bq.shape[1])) if held else columns(b.physiological)
+    by_body, by_stop, by_q = known.rows
     if transposed:
-        both = solve_1(np.column_stack([b1, by_stop]))
-        y, y_stop = both[:, :-1], both[:, -1]
-        zh = (bh - known.responses @ b1) / (by_jaw - known.coupling @ y_stop)
-        z1 = y - np.outer(y_stop, zh)
-        z0 = b0 if held else solve_0(b0 - np.outer(by_body, zh))
+        both = solve_1(np.column_stack([b1, by_stop.T]))
+        y, y_stop = both[:, :-n_q], both[:, -n_q:]
+        zq = np.linalg.solve(by_q.T - known.coupling.T @ y_stop, bq - known.responses.T @ b1)
+        z1 = y - y_stop @ zq
+        z0 = b0 if held else solve_0(b0 - by_body.T @ zq)
     else:
         z0, y = solve_0(b0), solve_1(b1)
-        zh = (bh - by_body @ z0 - by_stop @ y) / (by_jaw - by_stop @ known.responses)
-        z1 = y - np.outer(known.responses, zh)
-    height: Any = zh.reshape(np.shape(b.jaw_height))
+        zq = np.linalg.solve(by_q - by_stop @ known.responses, bq - by_body @ z0 - by_stop @ y)
+        z1 = y - known.responses @ zq
     base = None if held else _rows(z0, b.physiological)
-    return Unknowns(physiological=base, stop=_rows(z1, b.stop), jaw_height=height)
+    return Unknowns(physiological=base, stop=_rows(z1, b.stop), q=_rows(zq, b.q))
 
 
 def _solve_columns(solver: LinearSolver, b: np.ndarray, values: Any = None) -> np.ndarray:
@@ -300,31 +306,28 @@ def _rows(columns: np.ndarray, like: Any) -> Any:
 # --- measures of a scene ---------------------------------------------------------------------------
 
 
-def see(scene: Scene, parts: Discretisation, u: Unknowns) -> Seen:
-    """The body with its states, as a JAX function of scene and unknowns."""
-    body = body_of(scene, parts)
+def see(scene: Scene, d: Discretisation, u: Unknowns) -> Equilibria:
+    """The scene with its states, as a JAX function of scene and unknowns."""
+    potential = potential_of(scene, d)
 
-    def state(free: Array | None, jaw_height: Array) -> State:
+    def state(free: Array | None, q: Array) -> State:
         assert free is not None
-        return with_equilibrium_pressure(body, positions(scene, parts, free), jaw_height)
+        return settled(potential, positions(scene, d, free), q)
 
-    return Seen(
-        body=body,
-        marks=parts.marks,
-        physiological=state(u.physiological, jnp.zeros(())),
-        stop=None if u.stop is None or u.jaw_height is None else state(u.stop, u.jaw_height),
-    )
+    in_body = state(u.physiological, jnp.zeros(len(RIGID)))
+    closed = () if u.stop is None or u.q is None else (state(u.stop, u.q),)
+    return Equilibria(potential=potential, marks=d.marks, states=(in_body, *closed))
 
 
-_read = jax.jit(lambda measure, seen: measure(seen), static_argnums=0)
+_read = jax.jit(lambda measure, equilibria: measure(equilibria), static_argnums=0)
 
 
-def measured(measure: Measure, scene: Scene, parts: Discretisation, u: Unknowns, ticket: Any) -> Array:
+def measured(measure: Measure, scene: Scene, d: Discretisation, u: Unknowns, ticket: Any) -> Array:
     """The measure at a known solution of a scene, differentiable in the scene.
 
     Several programs rather than one: they compile faster, and measures share all but their own.
     """
-    value: Array = _read(measure, see(scene, parts, implicit(scene, parts, u, ticket)))
+    value: Array = _read(measure, see(scene, d, implicit(scene, d, u, ticket)))
     return value
 
 
@@ -339,14 +342,14 @@ def evaluate(scene: Scene, measure: Measure, *, guess: Result | None = None) -> 
     """
     fixed = lax.stop_gradient(jax.tree_util.tree_map(jnp.asarray, scene))
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(fixed)):
-        parts, _ = discretise(scene)
-        u, ticket = _solve_in_worker(fixed, parts, measure.needs_stop)
+        d, _ = discretise(scene)
+        u, ticket = _solve_in_worker(fixed, d, measure.needs_stop)
     else:
         result = solve(jax.tree_util.tree_map(np.asarray, fixed), measure.needs_stop, guess)
-        parts = result.model.discretisation
+        d = result.model.discretisation
         known = solution(result, measure.needs_stop)
         u, ticket = known.u, register(known)
-    return measured(measure, scene, parts, u, ticket)
+    return measured(measure, scene, d, u, ticket)
 
 
 def solve(scene: Scene, to_stop: bool, guess: Result | None = None) -> Result:
@@ -354,11 +357,12 @@ def solve(scene: Scene, to_stop: bool, guess: Result | None = None) -> Result:
     return (clamp if to_stop else inflate)(scene, guess=guess)
 
 
-def _solve_in_worker(scene: Scene, parts: Discretisation, to_stop: bool) -> tuple[Unknowns, Any]:
+def _solve_in_worker(scene: Scene, d: Discretisation, to_stop: bool) -> tuple[Unknowns, Any]:
     """The solution of an abstract scene, by a callback to another process."""
-    many: Any = jax.ShapeDtypeStruct(parts.topology.free.shape, jnp.float64)
+    many: Any = jax.ShapeDtypeStruct(d.layout.free.shape, jnp.float64)
     one: Any = jax.ShapeDtypeStruct((), jnp.float64)
-    u = Unknowns(physiological=many, stop=many if to_stop else None, jaw_height=one if to_stop else None)
+    few: Any = jax.ShapeDtypeStruct((len(RIGID),), jnp.float64)
+    u = Unknowns(physiological=many, stop=many if to_stop else None, q=few if to_stop else None)
 
     def call(leaves: Scene) -> tuple[Unknowns, np.ndarray]:
         known = call_elsewhere(_solution_of, jax.tree_util.tree_map(np.asarray, leaves), to_stop)

@@ -18,7 +18,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 
 from jaxclamp.core.failures import Singular
-from jaxclamp.potential.tangent import Pattern
+from jaxclamp.fem.pattern import Pattern
 
 RELATIVE_RESIDUAL = 1e-8
 """A solution with a larger ||K x - b|| / ||b|| is refused."""
@@ -171,6 +171,11 @@ class LinearSolver:
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process, a solver without factors."""
         return LinearSolver, (self._pattern, self._choice)
+
+    @property
+    def n(self) -> int:
+        """Number of unknowns."""
+        return self._pattern.n
 
     def reset_counts(self) -> None:
         """Count and time from here."""

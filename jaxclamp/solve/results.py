@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError
-from jaxclamp.observe.measures import Measure, Seen
-from jaxclamp.observe.stresses import PEAK_SHARPNESS
-from jaxclamp.potential.model import SYMMETRY, Model, terms
-from jaxclamp.potential.tangent import State
+from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.figures import FIGURES
+from jaxclamp.observe.measures import PEAK_SHARPNESS, Measure
+from jaxclamp.potential.energy import State
+from jaxclamp.potential.model import Model
+from jaxclamp.potential.terms import needed
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.linear_solvers import LinearSolver
 from jaxclamp.solve.newton import Equilibrium
@@ -23,25 +25,8 @@ if TYPE_CHECKING:
     from jaxclamp.show.plots import Picture
 
 
-FINAL_KEYS = (
-    "jaw_travel_mm",
-    "lumen_height_mm",
-    "lumen_width_mm",
-    "occlusion",
-    "lumen_area_mm2",
-    "area_occlusion",
-    "clamp_force_N",
-    "max_contact_pressure_kPa",
-    "max_penetration_mm",
-    "axial_stress_at_P_kPa",
-    "axial_stress_ratio_at_P",
-    "circumferential_stress_ratio_at_P",
-    "peak_axial_stress_kPa",
-    "peak_axial_stress_location_mm",
-    "smooth_peak_axial_stress_kPa",
-    "J_min",
-    "J_max",
-)
+FINAL_KEYS = tuple(figure.key for figure in FIGURES if figure.contract)
+"""always in a result's `final`, null where no state converged"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +81,7 @@ class Result:
         Raises EquilibriumError if the stop was not reached, ValueError if it was not asked for.
         """
         self.require(measure.needs_stop)
-        return float(measure(self.seen))
+        return float(measure(self.equilibria))
 
     def require(self, to_stop: bool) -> None:
         """Raise EquilibriumError or ValueError unless there is something to measure or differentiate."""
@@ -106,15 +91,15 @@ class Result:
             raise ValueError("this result is of the artery without its clamp: use jaxclamp.clamp")
 
     @property
-    def seen(self) -> Seen:
-        """The body with its physiological state and, if it was closed, its last one."""
+    def equilibria(self) -> Equilibria:
+        """The scene with its state in the body and, if it was closed, its last one: what measures look at."""
         assert self.physiological is not None
         last = self.states[-1]
-        return Seen(
-            body=self.model.body,
+        closed = (last.state,) if last.stage == "clamping" else ()
+        return Equilibria(
+            potential=self.model.potential,
             marks=self.model.marks,
-            physiological=self.physiological.state,
-            stop=last.state if last.stage == "clamping" else None,
+            states=(self.physiological.state, *closed),
         )
 
     @property
@@ -145,32 +130,26 @@ class Result:
     @property
     def history(self) -> list[dict[str, Any]]:
         """One record per converged state from the physiological one on."""
-        return [self._relative(kept) for kept in self.closing]
+        return [self._record(kept) for kept in self.closing]
 
     @property
     def final(self) -> dict[str, Any]:
         """The record of the last converged state; None everywhere if it is not the artery in the body."""
         return self.history[-1] if self.history else dict.fromkeys(FINAL_KEYS)
 
-    def _relative(self, kept: Kept) -> dict[str, Any]:
-        """A state's record, with the quantities that refer to the physiological state."""
-        assert self.physiological is not None
-        base, v = self.physiological.values, kept.values
-        travel = max(base["outer_radius_mm"] - v["jaw_height_mm"], 0.0) if kept.stage == "clamping" else 0.0
-        relative = {
-            "stage": kept.stage,
-            "jaw_travel_mm": travel,
-            "occlusion": 1.0 - v["lumen_height_mm"] / base["lumen_height_mm"],
-            "area_occlusion": 1.0 - v["lumen_area_mm2"] / base["lumen_area_mm2"],
-            "axial_stress_ratio_at_P": _ratio(v["axial_stress_at_P_kPa"], base["axial_stress_at_P_kPa"]),
-            "circumferential_stress_ratio_at_P": _ratio(
-                v["circumferential_stress_at_P_kPa"], base["circumferential_stress_at_P_kPa"]
-            ),
-            "negative_pivots": kept.equilibrium.negative_pivots,
-            "snapped": kept.equilibrium.snapped,
-            "newton_iterations": kept.equilibrium.iterations,
-        }
-        return relative | {key: value for key, value in v.items() if key != "jaw_height_mm"}
+    def _record(self, kept: Kept) -> dict[str, Any]:
+        """A state's record."""
+        e = kept.equilibrium
+        seen = {key: value for key, value in kept.values.items() if key != "jaw_height_mm"}
+        return (
+            {"stage": kept.stage}
+            | seen
+            | {
+                "negative_pivots": e.negative_pivots,
+                "snapped": e.snapped,
+                "newton_iterations": e.iterations,
+            }
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The content of result.json."""
@@ -194,11 +173,12 @@ class Result:
             "errors": self.errors,
             "history": self.history,
             "model": {
-                "symmetry": SYMMETRY,
+                "symmetry": self.model.symmetry.share,
+                "modelled": self.model.symmetry.words,
                 "elements": self.model.mesh.n_cells,
                 "element": scene.mesh.element,
                 "unknowns": self.model.pattern.n,
-                "terms": terms(scene),
+                "terms": needed(scene),
                 "peak_sharpness": PEAK_SHARPNESS,
             },
             "solver": self.solver,
@@ -241,10 +221,6 @@ class Result:
 
 def _radius(kept: Kept | None) -> float | None:
     return None if kept is None else 0.5 * kept.values["lumen_height_mm"]
-
-
-def _ratio(value: float, base: float) -> float | None:
-    return value / base if base != 0.0 else None
 
 
 def versions() -> dict[str, str]:

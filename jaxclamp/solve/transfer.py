@@ -7,8 +7,8 @@ import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 
 from jaxclamp.fem.tube import angles, axial_fractions
+from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
-from jaxclamp.potential.tangent import State
 
 
 def transferred(state: State, old: Model, new: Model) -> State:
@@ -21,9 +21,12 @@ def transferred(state: State, old: Model, new: Model) -> State:
     bulk modulus times the error of the interpolation.
     """
     positions = np.asarray(state.x).reshape(*old.mesh.grid[::-1], 3)
+    if old.mesh.wraps:  # the first line again where the last one ends
+        positions = np.concatenate([positions, positions[:, :1]], axis=1)
     for axis, (known, wanted) in enumerate(zip(_lines(old), _lines(new), strict=True)):
         positions = (_linear if axis == RADIAL else _smooth)(positions, known, wanted, axis)
-    modes = np.zeros((len(new.body.stencils.modes), new.mesh.n_cells))
+    positions = positions[:, : new.mesh.grid[1]]
+    modes = np.zeros((len(new.discretisation.stencils.modes), new.mesh.n_cells))
     for layer, (first, last) in enumerate(new.mesh.layer_cells):
         start, end = old.mesh.layer_cells[layer]
         middles = _middles(old, layer)
@@ -31,7 +34,7 @@ def transferred(state: State, old: Model, new: Model) -> State:
         for axis, (known, wanted) in enumerate(zip(middles, _middles(new, layer), strict=True)):
             means = _linear(means, known, wanted, axis)
         modes[0, first:last] = means.ravel()
-    return State(x=jnp.asarray(positions.reshape(-1, 3)), p=jnp.asarray(modes), jaw_height=state.jaw_height)
+    return State(x=jnp.asarray(positions.reshape(-1, 3)), p=jnp.asarray(modes), q=state.q)
 
 
 RADIAL = 2

@@ -20,30 +20,17 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, Singular
+from jaxclamp.observe.figures import FIGURES, WHOLE
 from jaxclamp.scenes.address import get, replace
 from jaxclamp.scenes.scene import MeshSettings, Scene
-from jaxclamp.solve.clamping import clamp, inflate, predicted
+from jaxclamp.solve.clamping import clamp, inflate
 from jaxclamp.solve.results import Result
-
-FINAL = (
-    "jaw_travel_mm",
-    "lumen_height_mm",
-    "lumen_width_mm",
-    "lumen_area_mm2",
-    "clamp_force_N",
-    "axial_stress_at_P_kPa",
-    "smooth_peak_axial_stress_kPa",
-    "peak_axial_stress_kPa",
-)
-"""figures of the last state that an error is given for; those of layers have one each"""
+from jaxclamp.solve.warm import predicted
 
 CHANGE = 1e-3
 """relative change of a penalty for its derivative"""
 COARSENINGS = (1.3, 2.0)
 """elements of the scene over elements of its twin, per direction"""
-ORDER, ORDER_AT_A_POINT = 2.0, 1.0
-"""with which figures converge as the mesh is refined; stress at a point, such as P or where it peaks, has
-the cell's constant pressure in it, and the place of a peak wanders from point to point"""
 SOURCES = ("discretisation", "bulk", "contact_stiffness", "contact_smoothing")
 
 Errors = dict[str, dict[str, float | None]]
@@ -58,7 +45,7 @@ def figures(result: Result) -> dict[str, float]:
         "physiological.axial_stress_at_P_kPa": body["axial_stress_at_P_kPa"],
     }
     if result.states[-1].stage == "clamping":
-        for key in FINAL:
+        for key in (figure.key for figure in FIGURES if figure.order is not None):
             value = result.final[key]
             parts = value.items() if isinstance(value, dict) else [("", value)]
             found |= {f"{key}.{layer}" if layer else key: float(part) for layer, part in parts}
@@ -120,8 +107,14 @@ def _from_the_mesh(result: Result, values: dict[str, float]) -> dict[str, float 
         twin = figures(solve(scene, guess=result))
     except EquilibriumError:
         return dict.fromkeys(values)
-    order = lambda key: ORDER_AT_A_POINT if "_stress_" in key else ORDER  # noqa: E731
-    return {key: (value - twin[key]) / (1.0 - ratio ** order(key)) for key, value in values.items()}
+    return {key: (value - twin[key]) / (1.0 - ratio ** _order(key)) for key, value in values.items()}
+
+
+def _order(key: str) -> float:
+    """Order with which the figure of a key such as "peak_axial_stress_kPa.media" converges."""
+    name = key.removeprefix("physiological.").split(".")[0]
+    orders = {figure.key: figure.order for figure in FIGURES}
+    return orders.get(name) or WHOLE
 
 
 def _from_a_penalty(

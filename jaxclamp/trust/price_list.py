@@ -24,11 +24,12 @@ from scipy.optimize import brentq
 
 from jaxclamp.core.failures import EquilibriumError, NoReference
 from jaxclamp.core.progress import Progress
+from jaxclamp.fem.landmarks import layer_of_P
 from jaxclamp.observe.measures import smooth_peak_axial_stress
-from jaxclamp.observe.stresses import layer_of_P
+from jaxclamp.observe.stops import OcclusionStop
 from jaxclamp.potential.tangent import linearise
 from jaxclamp.scenes.address import replace
-from jaxclamp.scenes.scene import MeshSettings, OcclusionStop, Scene
+from jaxclamp.scenes.scene import MeshSettings, Scene
 from jaxclamp.sensitivity.implicit import evaluate
 from jaxclamp.solve.clamping import clamp
 from jaxclamp.solve.linear_solvers import available
@@ -186,7 +187,7 @@ def _in_single_precision(result: Result) -> tuple[None, str]:
     )
     last = result.states[-1].equilibrium
     with jax.numpy_dtype_promotion("standard"):
-        lin = linearise(single(result.model.body), single(last.state), single(last.pressure))
+        lin = linearise(single(result.model.potential), single(last.state))
     left = float(np.linalg.norm(np.asarray(lin.residual, float))) / float(last.lin.reactions)
     return None, (
         f"forces of float32 leave {left:.1g} of the reactions at the solution of float64: not admissible"

@@ -1,0 +1,123 @@
+"""Which entries the sparse tangent has, and where the matrix of each cell goes in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxclamp.core.records import record, static
+
+PAIRS = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
+"""component pairs (i, j) of a symmetric 3 x 3 block, in the order in which matrices keep them"""
+
+POINTS_PER_BLOCK = 2400
+"""quadrature points differentiated together: their intermediate arrays then fit a core's cache"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pattern:
+    """Upper triangle (with diagonal) of the symmetric tangent, by compressed rows."""
+
+    indptr: np.ndarray
+    indices: np.ndarray
+
+    @property
+    def n(self) -> int:
+        """Number of unknowns."""
+        return len(self.indptr) - 1
+
+    @property
+    def diagonal(self) -> np.ndarray:
+        """Place of each diagonal entry in the values, (n,)."""
+        return self.indptr[:-1]
+
+
+@record
+class Region:
+    """Some cells or facets: where terms live, and where their matrices go."""
+
+    nodes: np.ndarray
+    """of each cell or facet, (n_en, n_cells)"""
+    blocks: tuple[tuple[int, int], ...] = static()
+    """first and last-plus-one cell of what is differentiated together; all of one size"""
+    slots: tuple[np.ndarray, ...]
+    """by block: place of each entry of its matrices in the sparse values; the place behind the last one
+    takes what belongs nowhere"""
+
+
+@record
+class Layout:
+    """Numbers of the unknowns."""
+
+    free: np.ndarray
+    """degree of freedom 3 node + component of each unknown, (n_free,)"""
+    n_nodes: int = static()
+    n_nonzeros: int = static()
+    """entries of the sparse tangent"""
+
+
+def cut_into_blocks(counts: tuple[int, ...], points_per_cell: int) -> int:
+    """Cells per block: a common divisor of the layers' counts.
+
+    One size means one compiled program; a block within a layer has one material.
+    """
+    common = math.gcd(*counts)
+    wanted = max(POINTS_PER_BLOCK // points_per_cell, 1)
+    return max(d for d in range(1, min(wanted, common) + 1) if common % d == 0)
+
+
+def build_pattern(
+    held: np.ndarray, regions: Mapping[str, tuple[np.ndarray, int]]
+) -> tuple[Layout, dict[str, Region], Pattern]:
+    """Number the unknowns and find the place of every matrix entry in the sparse tangent.
+
+    held: True for degrees of freedom that are no unknowns, (n_nodes, 3)
+    regions: by name, the nodes of cells or facets (n_en, n_cells) and the cells of a block
+    """
+    free = np.flatnonzero(~held.ravel())
+    unknown = np.full(held.size, -1)
+    unknown[free] = np.arange(len(free))
+    n = len(free)
+    blocks = {
+        name: tuple((first, first + size) for first in range(0, nodes.shape[1], size))
+        for name, (nodes, size) in regions.items()
+    }
+    entries = {
+        (name, block): _keys(regions[name][0][:, slice(*block)], unknown, n)
+        for name in regions
+        for block in blocks[name]
+    }
+    joined = np.concatenate(list(entries.values()))
+    distinct, place = np.unique(joined, return_inverse=True)
+    skipped = int(distinct[0] == -1)
+    n_nonzeros = len(distinct) - skipped
+    slots = np.where(joined < 0, n_nonzeros, place - skipped).astype(np.int32)
+    ends = np.cumsum([keys.size for keys in entries.values()])[:-1]
+    by_block = dict(zip(entries, np.split(slots, ends), strict=True))
+    rows, indices = np.divmod(distinct[skipped:], n)
+    indptr = np.searchsorted(rows, np.arange(n + 1))
+    found = {
+        name: Region(
+            nodes=nodes.astype(np.int32),
+            blocks=blocks[name],
+            slots=tuple(by_block[name, block] for block in blocks[name]),
+        )
+        for name, (nodes, _) in regions.items()
+    }
+    layout = Layout(free=free.astype(np.int32), n_nodes=len(held), n_nonzeros=n_nonzeros)
+    return layout, found, Pattern(indptr.astype(np.int32), indices.astype(np.int32))
+
+
+def _keys(nodes: np.ndarray, unknown: np.ndarray, n: int) -> np.ndarray:
+    """Row times n plus column of every matrix entry [a, b, pair, cell], -1 for what belongs nowhere."""
+    rows = unknown[3 * nodes[:, None, None, :] + PAIRS[:, 0][:, None]]
+    columns = unknown[3 * nodes[None, :, None, :] + PAIRS[:, 1][:, None]]
+    rows, columns = np.broadcast_arrays(rows, columns)
+    key = np.minimum(rows, columns) * np.int64(n) + np.maximum(rows, columns)
+    local = np.arange(len(nodes))
+    mirror = (local[:, None] > local[None])[:, :, None] & (PAIRS[:, 0] == PAIRS[:, 1])
+    key[(rows < 0) | (columns < 0) | mirror[..., None]] = -1
+    return key.ravel()

@@ -1,0 +1,95 @@
+"""Energy, forces and independent checks of one equilibrium, from the gradient of the potential."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxclamp.core.records import record
+from jaxclamp.core.tensors import total
+from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.measures import jaw_forces
+from jaxclamp.potential.densities import swept_volume
+from jaxclamp.potential.energy import energy, group_energy, group_points, lumen_volume
+from jaxclamp.potential.terms import BLOOD, INTIMA, JAWS, Potential
+
+
+def between_walls(potential: Potential, x: Array) -> Array:
+    """Force with which the inner walls press on each other in the modelled part, by side, mN, (n_sides,)."""
+
+    def at(planes: Array) -> Array:
+        groups = potential.of(INTIMA)
+        moved = [
+            dataclasses.replace(g.terms[0], here=dataclasses.replace(g.terms[0].here, plane=plane))
+            for g, plane in zip(groups, planes, strict=True)
+        ]
+        placed = [dataclasses.replace(g, terms=(term,)) for g, term in zip(groups, moved, strict=True)]
+        return total(group_energy(group, x, jnp.zeros(0)) for group in placed)
+
+    groups = potential.of(INTIMA)
+    sides = jnp.asarray([group.terms[0].here.side for group in groups], float)
+    return sides * jax.grad(at)(jnp.zeros(len(groups)))
+
+
+@record
+class Balance:
+    """Energy, forces on the jaws, and the checks of equilibrium.
+
+    They come from the gradient of the potential, not from the assembled system that was solved.
+    """
+
+    energy: Array
+    """of wall, blood and contact of the whole artery, uJ"""
+    residual: Array
+    """norm of the forces on free nodes, mN"""
+    jaw_force: Array
+    """on one jaw of the whole artery, mN"""
+    inner_force: Array
+    """between opposite inner walls of the whole artery, mN"""
+    error: Array
+    """of the vertical balance, see `balance`"""
+
+
+def balance(e: Equilibria) -> Balance:
+    """Vertical balance of the modelled part: supports, pressure and inner walls against the jaws.
+
+    Relative to the largest of them, or, where all vanish, to a thousandth of the wall's other forces.
+    """
+    x, q, free = e.last.x, e.last.q, e.potential.layout.free
+    pressure = e.potential.of(BLOOD)[0].terms[0].here.pressure
+    stored, elastic = jax.value_and_grad(energy, argnums=1)(e.potential.at_pressure(0.0), x, q)
+    volume, swelling = jax.value_and_grad(lumen_volume, argnums=1)(e.potential, x)
+    jaws, inner = jaw_forces(e.potential, x, q), between_walls(e.potential, x)
+    up = jnp.asarray([float(group.terms[0].here.side) for group in e.potential.of(JAWS)])
+    held = jnp.ones(x.size).at[free].set(0.0).reshape(x.shape)[:, 1]
+    pushed = pressure * _lifting(e)
+    supports = (elastic[:, 1] - pushed) * held
+    imbalance = jnp.abs(jnp.sum(supports) + jnp.sum(pushed) + up @ inner - up @ jaws)
+    sizes = [jnp.max(jnp.abs(jaws)), jnp.sum(pushed), jnp.sum(jnp.abs(supports))]
+    largest = jnp.max(jnp.stack(sizes))
+    return Balance(
+        energy=e.marks.symmetry.parts * (stored - pressure * volume),
+        residual=jnp.linalg.norm((elastic - pressure * swelling).ravel()[free]),
+        jaw_force=e.marks.symmetry.parts_of_a_jaw * jnp.sum(jaws),
+        inner_force=e.marks.symmetry.parts_of_a_jaw * jnp.sum(inner),
+        error=imbalance / (jnp.maximum(largest, 1e-3 * jnp.linalg.norm(elastic)) + 1e-6),
+    )
+
+
+def _lifting(e: Equilibria) -> Array:
+    """Vertical force of a unit pressure on each node, mm^2: int N n_y da, (n_nodes,)."""
+    (group,) = e.potential.of(BLOOD)
+    x, weights = e.last.x, group.terms[0].here.weights
+
+    def lifted(shift: Array) -> Array:
+        y = group_points(group, x)
+        raised = {**y, (0, 1): y[0, 1] + shift}
+        return 2.0 * jnp.sum(swept_volume(raised, weights))
+
+    # int N n_y da: the volume 1/2 (x n_x + y n_y) da changes by half of n_y da as a point is raised
+    slope = jax.grad(lifted)(jnp.zeros((len(weights), group.nodes.shape[1])))
+    at_corners = group.stencil[:, 0].T @ slope
+    return jnp.zeros(x.shape[0]).at[group.nodes].add(at_corners)

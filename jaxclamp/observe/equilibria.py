@@ -1,0 +1,52 @@
+"""What is known of a scene once it is solved: its potential and a trajectory of equilibria."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from jaxclamp.core.records import record
+from jaxclamp.fem.landmarks import Landmarks
+from jaxclamp.observe.stresses import Stresses, layer_stresses
+from jaxclamp.physics.jaws import Jaw
+from jaxclamp.potential.energy import State
+from jaxclamp.potential.terms import JAWS, Potential
+
+
+@record
+class Equilibria:
+    """A scene's potential and its equilibria in order; what measures, stops and figures look at."""
+
+    potential: Potential
+    marks: Landmarks
+    states: tuple[State, ...]
+    """in the body, then closing; the last is the one asked about"""
+    known_stresses: tuple[tuple[Stresses, ...], ...] | None = None
+    """by state and layer, where they are at hand"""
+
+    @property
+    def body(self) -> State:
+        """The physiological state: under blood pressure and stretch, without the clamp."""
+        return self.states[0]
+
+    @property
+    def last(self) -> State:
+        """The state that is asked about: at the stop, for a measure of a whole clamping."""
+        return self.states[-1]
+
+    @property
+    def in_body(self) -> Equilibria:
+        """The physiological state as the one asked about."""
+        known = None if self.known_stresses is None else self.known_stresses[:1]
+        return dataclasses.replace(self, states=self.states[:1], known_stresses=known)
+
+    @property
+    def jaw(self) -> Jaw:
+        """The jaw's shape."""
+        jaw: Jaw = self.potential.of(JAWS)[0].terms[0].here.jaw
+        return jaw
+
+    def stresses(self, layer: int) -> Stresses:
+        """Stress at the quadrature points of a layer in the last state."""
+        if self.known_stresses is not None:
+            return self.known_stresses[-1][layer]
+        return layer_stresses(self.potential, self.last, layer)

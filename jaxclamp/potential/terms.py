@@ -1,0 +1,326 @@
+"""The list of terms: the potential of a scene is their sum, and everything else loops over them.
+
+    Pi(x, p; q) = sum_cells int [psi_bar(F) + p (J - 1)] dV - 1/2 p' M p      wall, incompressibility
+                  - pressure * V_lumen(x)                                     blood pressure
+                  + int phi(gap(x; q)) dA                                     jaw contact
+                  + int phi(y + smoothing) dA                                 intima contact
+
+of the modelled part, with one or four pressures p per cell and M = int N_m N_n / bulk dV, so that at
+equilibrium p = bulk (J - 1) averaged over the cell (mean dilatation, Q1/P0) or projected on the linear
+functions (Q2/P1); q are the rigid coordinates (`densities.RIGID`).
+
+A term says where it lives (a region of the mesh), what it looks at there (a stencil), and its density.
+Terms of one region and stencil form a group: they are differentiated together. To add a term, write its
+density and one entry of `KINDS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxclamp.core.records import record, static
+from jaxclamp.fem.pattern import Layout, Region
+from jaxclamp.fem.stencils import Stencils
+from jaxclamp.physics.contact import Contact
+from jaxclamp.potential.bodies import Body, facet_areas, pressure_stiffness, solids
+from jaxclamp.potential.densities import (
+    Blood,
+    Density,
+    Meeting,
+    Touch,
+    blood_energy,
+    intima_energy,
+    jaw_energy,
+    shape_energy,
+)
+from jaxclamp.scenes.scene import Artery, Clamp, Scene
+
+
+@record
+class Term:
+    """One summand of the potential: the integral of a density over the points of a region."""
+
+    name: str = static()
+    """as shown to users"""
+    region: str = static()
+    stencil: str = static()
+    density: Density = static()
+    here: Any
+    """what the density knows of its points; in a group of several blocks, arrays of two or more axes have
+    the cells last"""
+    moved: bool = static(False)
+    """the density depends on the rigid coordinates"""
+
+
+@record
+class Volume:
+    """Cells keep their volume: 1/2 D' M^-1 D with D = int N_m (J - 1) dV, by pressures of the cells.
+
+    It lives on the points of a solid, whose term comes first in its group.
+    """
+
+    name: str = static()
+    region: str = static()
+    stencil: str = static()
+    cells: tuple[int, int] = static()
+    """first and last-plus-one among the pressures of a state"""
+    stiffness: Array
+    """M^-1, kPa/mm^3, (n_m, n_m, n_cells)"""
+
+
+@record
+class Group:
+    """Terms on the same points."""
+
+    region: str = static()
+    nodes: np.ndarray
+    """(n_en, n_cells)"""
+    blocks: tuple[tuple[int, int], ...] = static()
+    slots: tuple[np.ndarray, ...]
+    stencil: Array
+    """(n_q, n_c, n_en)"""
+    terms: tuple[Term, ...]
+    volume: Volume | None
+    modes: Array | None
+    """of the pressure, (n_m, n_q); None without `volume`"""
+
+    @property
+    def moved(self) -> bool:
+        """True if a term depends on the rigid coordinates."""
+        return any(term.moved for term in self.terms)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the terms."""
+        return tuple(term.name for term in (*self.terms, *([] if self.volume is None else [self.volume])))
+
+
+@record
+class Potential:
+    """The sum of all terms, and how its unknowns are numbered."""
+
+    groups: tuple[Group, ...]
+    layout: Layout
+
+    def of(self, name: str) -> tuple[Group, ...]:
+        """The groups with a term of that name, such as "jaw contact": one for each jaw modelled."""
+        return tuple(group for group in self.groups if name in group.names)
+
+    @property
+    def layers(self) -> tuple[Group, ...]:
+        """The groups of the wall, from inside to outside."""
+        return tuple(group for group in self.groups if group.volume is not None)
+
+    def keeping(self, wanted: Callable[[str], bool]) -> Potential:
+        """The potential with those groups alone whose terms are wanted, by name."""
+        kept = tuple(group for group in self.groups if any(wanted(term.name) for term in group.terms))
+        return dataclasses.replace(self, groups=kept)
+
+    @property
+    def surfaces(self) -> Potential:
+        """All terms but those of the wall."""
+        return dataclasses.replace(self, groups=tuple(g for g in self.groups if g.volume is None))
+
+    @property
+    def artery(self) -> Potential:
+        """Wall and blood alone."""
+        return self.keeping(lambda name: name not in OF_THE_CLAMP)
+
+    @property
+    def clamp(self) -> Potential:
+        """Contact alone."""
+        return self.keeping(lambda name: name in OF_THE_CLAMP)
+
+    def changed(self, name: str, change: Callable[[Any], Any]) -> Potential:
+        """The potential with what the terms of a name know of their points (`here`) changed."""
+
+        def in_group(group: Group) -> Group:
+            terms = tuple(
+                dataclasses.replace(term, here=change(term.here)) if term.name == name else term
+                for term in group.terms
+            )
+            return dataclasses.replace(group, terms=terms)
+
+        return dataclasses.replace(self, groups=tuple(map(in_group, self.groups)))
+
+    @property
+    def data(self) -> tuple[tuple[tuple[Any, ...], Array | None], ...]:
+        """The floats that a scene decides, by group: what terms know of their points, and M^-1."""
+        return tuple(
+            (tuple(term.here for term in group.terms), group.volume and group.volume.stiffness)
+            for group in self.groups
+        )
+
+    def with_data(self, data: tuple[tuple[tuple[Any, ...], Array | None], ...]) -> Potential:
+        """The potential with other floats, of the form of `data`."""
+
+        def filled(group: Group, heres: tuple[Any, ...], stiffness: Array | None) -> Group:
+            known = zip(group.terms, heres, strict=True)
+            terms = tuple(dataclasses.replace(term, here=here) for term, here in known)
+            volume = group.volume and dataclasses.replace(group.volume, stiffness=stiffness)
+            return dataclasses.replace(group, terms=terms, volume=volume)
+
+        pairs = zip(self.groups, data, strict=True)
+        return dataclasses.replace(self, groups=tuple(filled(group, *each) for group, each in pairs))
+
+    def at_pressure(self, pressure: Array | float) -> Potential:
+        """The potential with another blood pressure, kPa."""
+        return self.changed(BLOOD, lambda here: dataclasses.replace(here, pressure=jnp.asarray(pressure)))
+
+
+# --- the kinds of terms ---------------------------------------------------------------------------
+
+SIDES = {"upper": 1, "lower": -1}
+"""sign of y of each half of the circumference"""
+BLOOD, JAWS, INTIMA, KEPT_VOLUME = "blood pressure", "jaw contact", "intima contact", "incompressibility"
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """A scene's wall on its mesh, ready for terms."""
+
+    artery: Artery
+    clamp: Clamp
+    contact: Contact
+    body: Body
+    stencils: Stencils
+    sides: dict[str, np.ndarray]
+    """facets of each half of the circumference that is modelled, by its name in `SIDES`"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A kind of term: why a scene needs it, and its terms."""
+
+    reasons: Callable[[Scene], dict[str, str]]
+    """name of each term -> why it is there; terms that the scene does not need are left out"""
+    terms: Callable[[Made], Iterator[Term | Volume]]
+    of_the_clamp: str | None = None
+    """the term's name, if it is only there while the jaws close"""
+
+
+def _wall_reasons(scene: Scene) -> dict[str, str]:
+    return {
+        f"wall: {layer.name}": f"layer with law '{layer.material.law}', stress-free as an open sector "
+        "(residual stress needs no further term)"
+        for layer in scene.artery.layers
+    } | {
+        KEPT_VOLUME: "volume change averaged over each cell"
+        if scene.mesh.element == "q1p0"
+        else "pressure linear in each cell"
+    }
+
+
+def _wall(made: Made) -> Iterator[Term | Volume]:
+    names = [layer.name for layer in made.artery.layers]
+    yield from wall_terms(made.body, made.stencils, names)
+
+
+def wall_terms(body: Body, stencils: Stencils, names: Iterable[str]) -> Iterator[Term | Volume]:
+    """The terms of a body, layer by layer."""
+    known = zip(names, solids(body, stencils), body.mesh.layer_cells, strict=True)
+    for number, (name, solid, cells) in enumerate(known):
+        place = {"region": f"layer {number}", "stencil": "cells"}
+        yield Term(name=f"wall: {name}", density=shape_energy, here=solid, **place)
+        yield Volume(name=KEPT_VOLUME, cells=cells, stiffness=pressure_stiffness(solid, stencils), **place)
+
+
+def _blood_reasons(scene: Scene) -> dict[str, str]:
+    return {BLOOD: "follower load on the lumen, as enclosed volume"} if scene.artery.pressure != 0.0 else {}
+
+
+def _blood(made: Made) -> Iterator[Term]:
+    weights = jnp.asarray(made.stencils.lumen.weights)[:, None]
+    here = Blood(pressure=jnp.asarray(made.artery.pressure), weights=weights)
+    yield Term(name=BLOOD, region="lumen", stencil="lumen", density=blood_energy, here=here)
+
+
+def _jaw_reasons(scene: Scene) -> dict[str, str]:
+    return {JAWS: f"rigid '{scene.clamp.jaw.shape}' jaw against the outer wall, frictionless"}
+
+
+def _jaws(made: Made) -> Iterator[Term]:
+    areas = facet_areas(made.body, made.stencils.contact, outer=True)
+    for name, facets in made.sides.items():
+        dA = _some(areas, facets)
+        rule = made.stencils.contact
+        here = Touch(jaw=made.clamp.jaw, contact=made.contact, dA=dA, rule=rule, side=SIDES[name])
+        yield Term(
+            name=JAWS, region=f"{name} outside", stencil="contact", density=jaw_energy, here=here, moved=True
+        )
+
+
+def _intima_reasons(scene: Scene) -> dict[str, str]:
+    if scene.stop.far_from_closure():
+        return {}
+    return {INTIMA: "opposite inner walls meet in the plane of symmetry once the lumen closes"}
+
+
+def _intima(made: Made) -> Iterator[Term]:
+    areas = facet_areas(made.body, made.stencils.meeting, outer=False)
+    for name, facets in made.sides.items():
+        dA = _some(areas, facets)
+        here = Meeting(contact=made.contact, dA=dA, plane=jnp.zeros(()), side=SIDES[name])
+        yield Term(name=INTIMA, region=f"{name} inside", stencil="meeting", density=intima_energy, here=here)
+
+
+def _some(areas: Array, facets: np.ndarray) -> Array:
+    return areas if len(facets) == areas.shape[1] else areas[:, facets]
+
+
+KINDS = (
+    Kind(_wall_reasons, _wall),
+    Kind(_blood_reasons, _blood),
+    Kind(_jaw_reasons, _jaws, of_the_clamp=JAWS),
+    Kind(_intima_reasons, _intima, of_the_clamp=INTIMA),
+)
+
+OF_THE_CLAMP = tuple(kind.of_the_clamp for kind in KINDS if kind.of_the_clamp)
+"""terms that are only there while the jaws close"""
+
+
+def needed(scene: Scene, closing: bool = True) -> dict[str, str]:
+    """Name of every term that a scene needs, and why; `closing`: with those of the clamp."""
+    kinds = [kind for kind in KINDS if closing or not kind.of_the_clamp]
+    return {name: reason for kind in kinds for name, reason in kind.reasons(scene).items()}
+
+
+def all_terms(made: Made) -> tuple[Term | Volume, ...]:
+    """Every term that a scene of this kind can have, needed or not: derivatives see them all."""
+    return tuple(term for kind in KINDS for term in kind.terms(made))
+
+
+def build_potential(
+    terms: Iterable[Term | Volume], regions: dict[str, Region], stencils: Stencils, layout: Layout
+) -> Potential:
+    """Terms, grouped by the points that they share."""
+    at = {
+        "cells": stencils.cells,
+        "lumen": stencils.lumen.surface,
+        "contact": stencils.contact.position,
+        "meeting": stencils.meeting.position,
+    }
+    together: dict[tuple[str, str], list[Term | Volume]] = {}
+    for term in terms:
+        together.setdefault((term.region, term.stencil), []).append(term)
+
+    def group(place: tuple[str, str], members: list[Term | Volume]) -> Group:
+        region, volume = regions[place[0]], next((t for t in members if isinstance(t, Volume)), None)
+        return Group(
+            region=place[0],
+            nodes=region.nodes,
+            blocks=region.blocks,
+            slots=region.slots,
+            stencil=jnp.asarray(at[place[1]]),
+            terms=tuple(t for t in members if isinstance(t, Term)),
+            volume=volume,
+            modes=None if volume is None else jnp.asarray(stencils.modes),
+        )
+
+    return Potential(groups=tuple(group(*item) for item in together.items()), layout=layout)

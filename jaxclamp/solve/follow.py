@@ -1,0 +1,66 @@
+"""Walking a load path: Newton's method at growing parameters, with steps that adapt."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+
+from jaxclamp.core.failures import NotConverged
+from jaxclamp.potential.energy import State
+from jaxclamp.solve.newton import Equilibrium, Path, System, newton
+
+EASY_ITERATIONS = 5
+"""a step that converged in so many iterations lets the next one grow"""
+FIRST_STEP, SMALLEST_STEP, LARGEST_STEP = 0.12, 0.12 / 32, 0.15
+
+
+def stretched(state: State, end_height: float) -> State:
+    """The state with all axial positions scaled so that the end plane is at `end_height`, mm."""
+    z = state.x[:, 2]
+    if abs(float(jnp.max(z)) - end_height) <= 1e-14 * end_height:
+        return state
+    return dataclasses.replace(state, x=state.x.at[:, 2].set(z * (end_height / jnp.max(z))))
+
+
+def follow(
+    system: System,
+    start: Equilibrium,
+    path: Path,
+    end_height: Callable[[float], float],
+    on_step: Callable[[float, Equilibrium], None],
+    reached: Callable[[Equilibrium], bool] = lambda equilibrium: False,
+    first_step: float = FIRST_STEP,
+) -> tuple[float, Equilibrium, NotConverged | None]:
+    """Walk a path from its parameter 0 towards 1, as far as Newton goes.
+
+    Returns the parameter reached, its equilibrium, and None or the last failure.
+    end_height: of the artery's ends at a stretch, mm; on_step is called at every converged state, and
+    `reached` may end the walk there.
+    """
+    s, equilibrium, step = 0.0, start, first_step
+    failure: NotConverged | None = None
+    while s < 1.0:
+        if step < SMALLEST_STEP:
+            return s, equilibrium, failure
+        target = min(1.0, s + step)
+        if 1.0 - target < 0.3 * step:
+            target = 1.0
+        wanted = path(target)
+        guess = stretched(equilibrium.state, end_height(wanted.axial_stretch))
+        try:
+            found = newton(system, guess, wanted, equilibrium)
+        except NotConverged as error:
+            failure, step = error, 0.4 * (target - s)
+            continue
+        system.load_steps += 1
+        s, equilibrium = target, found
+        on_step(s, equilibrium)
+        if reached(equilibrium):
+            break
+        if found.iterations <= EASY_ITERATIONS:
+            step = min(1.3 * step, max(LARGEST_STEP, first_step))
+        elif found.iterations > EASY_ITERATIONS + 2:
+            step = 0.7 * step
+    return s, equilibrium, None
