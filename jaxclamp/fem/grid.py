@@ -22,7 +22,7 @@ class Mesh:
     element: Element = static()
     grid: tuple[int, int, int] = static()
     """nodes along (radial, circumferential, axial)"""
-    wraps: bool = static(False)
+    wraps: bool = static(default=False)
     """the circumferential direction is closed: its first grid line comes after its last"""
     radial: tuple[int, ...] = static()
     """cells through each layer"""

@@ -95,7 +95,7 @@ class Touch:
     """stress-free outer area of a point, mm^2, (n_q, n_facets)"""
     rule: FacetRule
     """where the points of a facet are"""
-    side: int = static(1)
+    side: int = static(default=1)
     """1: the upper jaw, -1: the lower one, its mirror image in y = 0"""
 
 
@@ -123,7 +123,7 @@ class Meeting:
     """stress-free area of a point of the lumen's surface, mm^2, (n_q, n_facets)"""
     plane: Array
     """height of the plane, mm"""
-    side: int = static(1)
+    side: int = static(default=1)
     """1: the upper wall, which stays above the plane, -1: the lower one"""
 
 

@@ -9,7 +9,6 @@ zz, xy, xz, yz) over all pairs of nodes. One program serves every piece of one k
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -309,6 +308,8 @@ def _rigid(potential: Potential, pieces: list[list[Linearised]]) -> tuple[Array,
         for (first, last), block in zip(group.blocks, blocks, strict=True):
             if block.coupling is None:
                 continue
+            assert block.rigid_slope is not None
+            assert block.rigid_stiffness is not None
             slope, stiffness = slope + block.rigid_slope, stiffness + block.rigid_stiffness
             nodes = group.nodes[:, first:last]
             mixed = [_added(field, nodes, part) for field, part in zip(mixed, block.coupling, strict=True)]
@@ -327,10 +328,9 @@ def advance(potential: Potential, state: State, dx: Array, dq: Array, fraction: 
 
     def condensed(group: Group) -> Array:
         assert group.volume is not None
-        assert group.modes is not None
-        D: Callable[[Array], Array] = lambda x: dilatations(  # noqa: E731
-            group.modes, group.terms[0].here, group_points(group, x)
-        )
+        modes, solid = group.modes, group.terms[0].here
+        assert modes is not None
+        D = lambda x: dilatations(modes, solid, group_points(group, x))  # noqa: E731
         now, change = jax.jvp(D, (state.x,), (step,))
         return condensed_pressures(group.volume.stiffness, now + change)
 

@@ -54,7 +54,7 @@ class Term:
     here: Any
     """what the density knows of its points; in a group of several blocks, arrays of two or more axes have
     the cells last"""
-    moved: bool = static(False)
+    moved: bool = static(default=False)
     """the density depends on the rigid coordinates"""
 
 
@@ -98,7 +98,8 @@ class Group:
     @property
     def names(self) -> tuple[str, ...]:
         """Of the terms."""
-        return tuple(term.name for term in (*self.terms, *([] if self.volume is None else [self.volume])))
+        names = tuple(term.name for term in self.terms)
+        return names if self.volume is None else (*names, self.volume.name)
 
 
 @record
@@ -153,7 +154,7 @@ class Potential:
     def data(self) -> tuple[tuple[tuple[Any, ...], Array | None], ...]:
         """The floats that a scene decides, by group: what terms know of their points, and M^-1."""
         return tuple(
-            (tuple(term.here for term in group.terms), group.volume and group.volume.stiffness)
+            (tuple(term.here for term in group.terms), getattr(group.volume, "stiffness", None))
             for group in self.groups
         )
 
@@ -163,7 +164,9 @@ class Potential:
         def filled(group: Group, heres: tuple[Any, ...], stiffness: Array | None) -> Group:
             known = zip(group.terms, heres, strict=True)
             terms = tuple(dataclasses.replace(term, here=here) for term, here in known)
-            volume = group.volume and dataclasses.replace(group.volume, stiffness=stiffness)
+            volume = group.volume
+            if volume is not None and stiffness is not None:
+                volume = dataclasses.replace(volume, stiffness=stiffness)
             return dataclasses.replace(group, terms=terms, volume=volume)
 
         pairs = zip(self.groups, data, strict=True)
@@ -226,9 +229,9 @@ def wall_terms(body: Body, stencils: Stencils, names: Iterable[str]) -> Iterator
     """The terms of a body, layer by layer."""
     known = zip(names, solids(body, stencils), body.mesh.layer_cells, strict=True)
     for number, (name, solid, cells) in enumerate(known):
-        place = {"region": f"layer {number}", "stencil": "cells"}
-        yield Term(name=f"wall: {name}", density=shape_energy, here=solid, **place)
-        yield Volume(name=KEPT_VOLUME, cells=cells, stiffness=pressure_stiffness(solid, stencils), **place)
+        region, stiffness = f"layer {number}", pressure_stiffness(solid, stencils)
+        yield Term(name=f"wall: {name}", region=region, stencil="cells", density=shape_energy, here=solid)
+        yield Volume(name=KEPT_VOLUME, region=region, stencil="cells", cells=cells, stiffness=stiffness)
 
 
 def _blood_reasons(scene: Scene) -> dict[str, str]:

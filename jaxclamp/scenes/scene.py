@@ -76,10 +76,17 @@ class Stop(abc.ABC):
         """What is to reach the target, in internal units: a JAX function of `observe.equilibria.Equilibria`."""
 
     def target(self) -> Array:
-        """The value at which closing ends: the record's only quantity."""
-        (field,) = (f for f in dataclasses.fields(cast(Any, self)) if "range" in f.metadata)
-        value: Array = getattr(self, field.name)
+        """The value at which closing ends: the record's only quantity, in internal units."""
+        value: Array = getattr(self, self._quantity().name)
         return value
+
+    def unit(self) -> str:
+        """The target's unit in scene files."""
+        return str(self._quantity().metadata["range"].unit)
+
+    def _quantity(self) -> dataclasses.Field[Any]:
+        (field,) = (f for f in dataclasses.fields(cast(Any, self)) if "range" in f.metadata)
+        return field
 
     def far_from_closure(self) -> bool:
         """True if opposite inner walls surely do not meet on the way to the stop."""

@@ -217,10 +217,8 @@ def solution(result: Result, to_stop: bool) -> Solution:
 
 def _rows_of_q(result: Result) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The stop's row, and below it those of the rigid coordinates that find their own equilibrium."""
-    e, lin = result.equilibria, result.states[-1].equilibrium.lin
-    by_body, (_, by_stop, by_q) = jax.device_get(
-        (_by_body(result.scene.stop, e), stop_row(result.scene.stop, e))
-    )
+    e, lin, stop = result.equilibria, result.states[-1].equilibrium.lin, result.scene.stop
+    by_body, (_, by_stop, by_q) = jax.device_get((_by_body(stop, e), stop_row(stop, e)))
     others = np.asarray(lin.coupling).T[1:]
     return (
         np.vstack([by_body, np.zeros_like(others)]),

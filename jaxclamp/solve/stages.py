@@ -241,7 +241,9 @@ class Clamping:
             return self.towards(scene.stop, now, float(scene.stop.target())), never
         self.require_room(now)
         coming = lambda e: self.share(e.state) > SEEN_COMING  # noqa: E731
-        return self.towards(OcclusionStop(occlusion=jnp.asarray(NEARLY_CLOSED)), now, NEARLY_CLOSED), coming
+        return self.towards(
+            OcclusionStop(kind="occlusion", occlusion=jnp.asarray(NEARLY_CLOSED)), now, NEARLY_CLOSED
+        ), coming
 
     def require_room(self, now: Equilibrium) -> None:
         """Raise EquilibriumError if the lumen is nearly closed already."""
@@ -254,8 +256,7 @@ class Clamping:
 
     def in_file_unit(self, value: float) -> str:
         """A value of the stop's measure with its unit, for a reader."""
-        (field,) = (f for f in dataclasses.fields(self.model.scene.stop) if "range" in f.metadata)
-        unit = field.metadata["range"].unit
+        unit = self.model.scene.stop.unit()
         return f"{value / UNIT_FACTOR[unit]:.3g} {unit}".rstrip()
 
     # --- the stop -------------------------------------------------------------------------------------
@@ -335,7 +336,7 @@ class Clamping:
     ) -> Equilibrium:
         """Follow a path; where Newton fails, take one step downhill at a held jaw and return."""
         options: dict[str, Any] = {} if first_step is None else {"first_step": first_step}
-        s, equilibrium, failure = follow(
+        _, equilibrium, failure = follow(
             self.system, start, path, self.model.end_height, say, reached, **options
         )
         if failure is None:
