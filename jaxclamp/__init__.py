@@ -39,11 +39,14 @@ from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
 
 __all__ = [
     "EquilibriumError",
+    "ForceStop",
     "Measure",
+    "OcclusionStop",
     "Progress",
     "Result",
     "Scene",
     "SceneError",
+    "TravelStop",
     "axial_stress_at_P",
     "circumferential_stress_at_P",
     "clamp",

@@ -14,10 +14,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxclamp.show.description import warnings
 
 import jaxclamp as jc
-from jaxclamp.fem.tube import build_mesh
-from jaxclamp.potential.model import warnings
 from tube import Incompressible, Sector, extra_stress
 
 Point = Mapping[str, float]
@@ -220,7 +219,7 @@ def is_sensible(point: Point) -> bool:
         scene = scene_of(point)
     except jc.SceneError:
         return False
-    if warnings(scene, build_mesh(scene.mesh)):
+    if warnings(scene):
         return False
     sectors = [
         Sector(

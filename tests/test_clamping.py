@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
+from jaxclamp.observe.stops import ForceStop, OcclusionStop, TravelStop
 from jaxclamp.physics.jaws import Flat, Spline
 from jaxclamp.physics.materials import GOH, NeoHookean
-from jaxclamp.scenes.scene import ForceStop, OcclusionStop, TravelStop
 from jaxclamp.solve.linear_solvers import available
 from tube import MEDIA, SEED_STRETCH, Compressible
 from walks import mesh

@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sp
 
 from jaxclamp.core.failures import Singular
-from jaxclamp.potential.tangent import Pattern
+from jaxclamp.fem.pattern import Pattern
 from jaxclamp.solve import linear_solvers
 from jaxclamp.solve.linear_solvers import BACK_ENDS, LinearSolver, available, full_matrix
 

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 
 from jaxclamp.core.failures import SceneError
 from jaxclamp.core.records import concrete_subclasses, quantity, record, static
-from jaxclamp.fem.tube import build_mesh, closed_radii
+from jaxclamp.fem.tube import build_tube, closed_radii
+from jaxclamp.observe.stops import OcclusionStop, TravelStop
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.address import replace
 from jaxclamp.scenes.files import (
@@ -30,7 +31,7 @@ from jaxclamp.scenes.files import (
     require_possible,
 )
 from jaxclamp.scenes.presets import presets
-from jaxclamp.scenes.scene import OcclusionStop, SolverSettings, Stop, TravelStop
+from jaxclamp.scenes.scene import SolverSettings, Stop
 
 HGO = {"law": "hgo", "c_kPa": 27.0, "k1_kPa": 0.64, "k2": 3.54, "fibre_angle_deg": 10.0, "bulk_kPa": 1e4}
 CHOICES = {"fibre_energy": "eq10", "fibre_invariant": "full"}
@@ -441,7 +442,7 @@ def test_layers_are_refused_exactly_where_the_closing_map_has_no_radius(angle):
     inner_squared = (middle * share) ** 2 - (middle**2 - layer["inner_radius_mm"] ** 2) * share
     if inner_squared > 0:
         scene = loads(table)
-        radii = np.asarray(closed_radii(build_mesh(scene.mesh), scene.artery))
+        radii = np.asarray(closed_radii(build_tube(scene.mesh), scene.artery))
         assert np.all(np.diff(radii) > 0)
         assert radii[0] > 0
     else:

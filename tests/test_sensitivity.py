@@ -261,8 +261,8 @@ def test_an_old_equilibrium_is_not_mistaken_for_another():
     for _ in range(10):
         register(known)
     scene = jax.tree_util.tree_map(lambda a: jnp.asarray(a, float), result.scene)
-    parts = result.model.discretisation
-    f = lambda s: jc.clamp_force()(see(s, parts, implicit(s, parts, known.u, ticket)))
+    d = result.model.discretisation
+    f = lambda s: jc.clamp_force()(see(s, d, implicit(s, d, known.u, ticket)))
     with pytest.raises(Exception, match="no longer kept"):
         jax.block_until_ready(jax.grad(f)(scene))
 

@@ -8,11 +8,11 @@ import pytest
 import jaxclamp as jc
 from jaxclamp.core.failures import NotConverged
 from jaxclamp.fem.tube import closed_positions
+from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import build_model
-from jaxclamp.potential.tangent import State
-from jaxclamp.solve import clamping
+from jaxclamp.solve import warm as warm_start
 from jaxclamp.solve.clamping import inflate
-from jaxclamp.solve.newton import LumenHeight
+from jaxclamp.solve.stops import Until
 from jaxclamp.solve.transfer import transferred
 
 
@@ -57,15 +57,15 @@ def test_a_round_tube_stays_round(coarse, mesh, back):
     artery = coarse.scene.artery
     tube = State(
         x=closed_positions(old.mesh, old.scene.mesh, artery),
-        p=np.ones((len(old.body.stencils.modes), old.mesh.n_cells)),
-        jaw_height=coarse.states[0].state.jaw_height,
+        p=np.ones((len(old.discretisation.stencils.modes), old.mesh.n_cells)),
+        q=coarse.states[0].state.q,
     )
     wanted = closed_positions(new.mesh, new.scene.mesh, artery)
     moved = transferred(tube, old, new)
     tolerance = 2e-3 if old.mesh.grid[1] > 5 else 1e-2
     np.testing.assert_allclose(moved.x, wanted, atol=tolerance * float(np.max(np.abs(wanted[:, 0]))))
     np.testing.assert_allclose(moved.p[0], 1.0, rtol=1e-14)
-    planes = new.mesh.fold_plane, new.mesh.compression_plane, new.mesh.clamp_plane
+    planes = new.mesh.plane(1, 0), new.mesh.plane(1, -1), new.mesh.plane(2, 0)
     for axis, plane in zip((1, 0, 2), planes, strict=True):
         np.testing.assert_allclose(moved.x[plane, axis], 0.0, atol=1e-15 + 1e-12 * artery.length)
 
@@ -135,13 +135,13 @@ def test_a_state_that_is_too_far_off_is_settled_first(coarse, monkeypatch):
     scene, failed = on_mesh(coarse.scene, axial=14), []
 
     def first_fails(system, state, step, *known):
-        if isinstance(step.closing, LumenHeight) and not failed:
+        if isinstance(step.closing, Until) and not failed:
             failed.append(step)
             raise NotConverged("for the test")
         return newton(system, state, step, *known)
 
-    cold, newton = jc.clamp(scene), clamping.newton
-    monkeypatch.setattr(clamping, "newton", first_fails)
+    cold, newton = jc.clamp(scene), warm_start.newton
+    monkeypatch.setattr(warm_start, "newton", first_fails)
     warm = jc.clamp(scene, guess=coarse)
     assert failed
     assert len(warm.states) == 3, "the guess was dropped"
@@ -153,7 +153,7 @@ def test_a_distant_guess_of_another_title_and_solver(coarse):
     scene = jc.replace(coarse.scene, "clamp.jaw.radius", 1.5)
     solver = dataclasses.replace(scene.solver, tolerance=1e-10, linear_solver="splu")
     scene = dataclasses.replace(scene, title="another", solver=solver)
-    halfway = clamping.between(coarse.scene, scene, 0.5)
+    halfway = warm_start.between(coarse.scene, scene, 0.5)
     assert (halfway.title, float(halfway.clamp.jaw.radius)) == ("another", 2.25)
     warm = jc.clamp(scene, guess=coarse)
     np.testing.assert_allclose(warm.states[-1].state.x, jc.clamp(scene).states[-1].state.x, atol=1e-6)

@@ -11,8 +11,8 @@ import jaxclamp as jc
 from jaxclamp.physics.materials import HGO, Material, NeoHookean
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.scene import Layer, MeshSettings, Scene
-from jaxclamp.solve.clamping import _Walk
 from jaxclamp.solve.newton import Equilibrium
+from jaxclamp.solve.stages import Clamping
 from tube import Sector
 
 
@@ -63,7 +63,13 @@ def tube_scene(
 def inflate(scene: Scene, like: Model | None = None) -> tuple[Model, Equilibrium, Equilibrium]:
     """Model, load-free and physiological state, without reading anything off them."""
     model = build_model(scene, like)
-    walk = _Walk(model, lambda event: None, 0.0)
-    walk.keep = lambda *_: None  # type: ignore[method-assign]
-    load_free = walk.load_free(None)
-    return model, load_free, walk.physiological(load_free, None)
+    clamping = Unread(model, lambda event: None)
+    load_free = clamping.load_free()
+    return model, load_free, clamping.in_body(load_free)
+
+
+class Unread(Clamping):
+    """A clamping that reads no figures off its states: they cost compilation on every new mesh."""
+
+    def keep(self, *_: Any) -> None:
+        pass

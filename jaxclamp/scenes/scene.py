@@ -73,7 +73,7 @@ class Stop(abc.ABC):
 
     @abc.abstractmethod
     def measure(self, equilibria: Any) -> Array:
-        """What is to reach the target, in internal units: a JAX function of `observe.equilibria.Equilibria`."""
+        """What is to reach the target, in internal units: a JAX function of `Equilibria`."""
 
     def target(self) -> Array:
         """The value at which closing ends: the record's only quantity, in internal units."""

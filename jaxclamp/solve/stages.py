@@ -241,9 +241,8 @@ class Clamping:
             return self.towards(scene.stop, now, float(scene.stop.target())), never
         self.require_room(now)
         coming = lambda e: self.share(e.state) > SEEN_COMING  # noqa: E731
-        return self.towards(
-            OcclusionStop(kind="occlusion", occlusion=jnp.asarray(NEARLY_CLOSED)), now, NEARLY_CLOSED
-        ), coming
+        closed = OcclusionStop(kind="occlusion", occlusion=jnp.asarray(NEARLY_CLOSED))
+        return self.towards(closed, now, NEARLY_CLOSED), coming
 
     def require_room(self, now: Equilibrium) -> None:
         """Raise EquilibriumError if the lumen is nearly closed already."""
