@@ -34,6 +34,7 @@ from jaxclamp.scenes.address import replace  # noqa: E402
 from jaxclamp.scenes.files import dump_scene, load_scene  # noqa: E402
 from jaxclamp.scenes.scene import Scene  # noqa: E402
 from jaxclamp.sensitivity.adjoint import value_and_gradient  # noqa: E402
+from jaxclamp.sensitivity.gradients import gradients  # noqa: E402
 from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
 from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
 
@@ -53,6 +54,7 @@ __all__ = [
     "clamp_force",
     "dump_scene",
     "evaluate",
+    "gradients",
     "jaw_curvature",
     "jaw_half_width",
     "jaw_travel",
