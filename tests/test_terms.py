@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxclamp.show.description import describe
 
 import jaxclamp as jc
 from jaxclamp.fem.tube import closed_positions
@@ -20,7 +21,6 @@ from jaxclamp.potential.energy import with_equilibrium_pressure
 from jaxclamp.potential.model import Model, build_model, potential_of
 from jaxclamp.potential.tangent import assemble, cut, linearise, linearise_piece
 from jaxclamp.potential.terms import BLOOD, INTIMA, JAWS, KEPT_VOLUME, Kind, Term, needed
-from jaxclamp.show.description import describe
 from jaxclamp.solve.stages import Clamping
 from tube import MEDIA
 from walks import material
@@ -178,7 +178,7 @@ def test_a_term_of_ones_own_is_one_entry(with_bed):
     result = jc.clamp(scene)
     assert result.final["residual_mN"] < 1e-4
     assert result.final["clamp_force_N"] > 0.0
-    value, gradient = jc.value_and_gradient(result, jc.clamp_force())
+    _, gradient = jc.value_and_gradient(result, jc.clamp_force())
     h = 1e-4
     forces = [
         jc.clamp(jc.replace(scene, "clamp.jaw.radius", 3.0 + s * h), guess=result).measure(jc.clamp_force())

@@ -186,10 +186,11 @@ def test_quadratic_tube_closed(case):
 def test_a_closed_ring_is_free_of_stress(element):
     sectors, _, _ = CASES["closed ring"]
     model, load_free, _ = inflate(tube_scene(sectors, 0.0, 1.0, MESHES[element][0], BULK))
-    (found,) = stresses(model.potential, load_free.state)
+    every = stresses(model.potential, load_free.state)
     assert float(load_free.state.x[model.marks.lumen_top, 1]) == pytest.approx(2.0, rel=1e-10)
-    for component in (found.circumferential, found.axial, found.radial):
-        np.testing.assert_allclose(component, 0.0, atol=1e-8)
+    for found in every:
+        for component in (found.circumferential, found.axial, found.radial):
+            np.testing.assert_allclose(component, 0.0, atol=1e-8)
 
 
 def test_nearly_incompressible_tube():

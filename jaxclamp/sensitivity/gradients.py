@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
-from jaxclamp.core.failures import SceneError
 from jaxclamp.observe.measures import Measure
+from jaxclamp.scenes import address
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.sensitivity.adjoint import value_and_gradient
 from jaxclamp.solve.results import Result
@@ -36,13 +34,13 @@ def gradients(
     asked = _checked(measures)
     if isinstance(paths, str):
         raise TypeError(f"paths = {paths!r}: expected a list of addresses, such as [{paths!r}]")
-    known = np.zeros(0) if paths is None else _floats(jax.tree_util.tree_map(np.asarray, result.scene), paths)
+    places = [address.describe(result.scene, path).path for path in paths or ()]
     pairs = [value_and_gradient(result, measure) for measure in asked]
     values = np.array([value for value, _ in pairs], float)
     if paths is None:
         return values, tuple(gradient for _, gradient in pairs)
-    slopes = [_floats(gradient, paths) for _, gradient in pairs]
-    return values, np.array(slopes, float).reshape(len(asked), known.size)
+    slopes = [_floats(gradient, places) for _, gradient in pairs]
+    return values, np.array(slopes, float).reshape(len(asked), _floats(result.scene, places).size)
 
 
 def _checked(measures: Any) -> tuple[Measure, ...]:
@@ -65,20 +63,6 @@ def _said(found: Any) -> str:
 
 
 def _floats(scene: Scene, paths: Sequence[str]) -> np.ndarray:
-    """The floats of a scene of arrays at some addresses, one after another, (n_floats,)."""
-    parts = [np.ravel(np.asarray(_at(scene, path))) for path in paths]
+    """The floats of a scene at some canonical addresses, one after another, (n_floats,)."""
+    parts = [np.ravel(np.asarray(address.get(scene, path), float)) for path in paths]
     return np.concatenate([np.zeros(0), *parts])
-
-
-def _at(scene: Scene, path: str) -> Any:
-    """The array in a scene of arrays at an address. Raises SceneError if there is none."""
-    node: Any = scene
-    for part in path.split("."):
-        match = re.fullmatch(r"([A-Za-z_]\w*)((?:\[\d+\])*)", part)
-        node = getattr(node, match[1], None) if match else None
-        for number in re.findall(r"\d+", match[2]) if match else ():
-            items = node if isinstance(node, tuple) else ()
-            node = items[int(number)] if int(number) < len(items) else None
-    if not isinstance(node, np.ndarray | jax.Array):
-        raise SceneError(f"{path}: expected the address of a float of the scene, such as clamp.jaw.radius")
-    return node

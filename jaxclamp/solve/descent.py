@@ -15,6 +15,7 @@ from jaxclamp.core.failures import NotConverged, Singular
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.tangent import Linearisation, advance
 from jaxclamp.potential.terms import INTIMA, JAWS, Potential, Volume
+from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.newton import (
     LARGEST_MOVE,
     Equilibrium,
@@ -32,6 +33,9 @@ MAX_DESCENT = 150
 MAX_SHIFTS = 30
 SUFFICIENT_FALL = 1e-4
 GOOD_MODEL = 0.3
+EASY_BULK, EASY_CONTACT = 400.0, 100.0
+"""bulk modulus, and contact stiffness times the wall's thickness, over its shear modulus, with which the
+way downhill is easy"""
 SMALLEST_STIFFENING = 1 / 32
 """eased penalties are restored in steps of at least this share of the way, or given up"""
 
@@ -94,6 +98,18 @@ class Ease:
         changed = potential.changed(JAWS, softer).changed(INTIMA, softer)
         groups = tuple(dataclasses.replace(g, volume=lighter(g.volume)) for g in changed.groups)
         return dataclasses.replace(changed, groups=groups)
+
+
+def ease_of(scene: Scene) -> Ease:
+    """Penalties brought down to where they still do their work: well above the stiffness of the wall."""
+    materials = [layer.material for layer in scene.artery.layers]
+    wall = sum(float(layer.thickness) for layer in scene.artery.layers)
+    c = max(float(np.max(np.asarray(material.c))) for material in materials)
+    bulk = max(float(np.max(np.asarray(material.bulk))) for material in materials)
+    return Ease(
+        bulk=min(1.0, EASY_BULK * c / bulk),
+        contact=min(1.0, EASY_CONTACT * c / (float(scene.contact.stiffness) * wall)),
+    )
 
 
 def descend_eased(system: System, state: State, step: Step, ease: Ease) -> Equilibrium:

@@ -25,7 +25,7 @@ from jaxclamp.potential.energy import State, with_equilibrium_pressure
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import INTIMA, needed
 from jaxclamp.scenes.scene import Stop
-from jaxclamp.solve.descent import Ease, descend_eased
+from jaxclamp.solve.descent import descend_eased, ease_of
 from jaxclamp.solve.follow import follow, stretched
 from jaxclamp.solve.inflation import inflated_positions, inflated_radius
 from jaxclamp.solve.linear_solvers import LinearSolver
@@ -48,9 +48,6 @@ LARGEST_SINKING = 0.5
 RESCUE_MOVE = 0.02
 """jaw move of a descent, as part of the outer radius"""
 MAX_RESCUES = 60
-EASY_BULK, EASY_CONTACT = 400.0, 100.0
-"""bulk modulus, and contact stiffness times the wall's thickness, over its shear modulus, with which the
-way downhill is easy"""
 LOAD_STEP = 0.3
 """first step of pressure and stretch, as part of the whole"""
 
@@ -381,20 +378,7 @@ class Clamping:
             found = newton(self.system, start, step)
             if not found.negative_pivots:
                 return found
-        return descend_eased(self.system, start, step, self.ease)
-
-    @property
-    def ease(self) -> Ease:
-        """Penalties brought down to where they still do their work: well above the stiffness of the wall."""
-        scene = self.model.scene
-        materials = [layer.material for layer in scene.artery.layers]
-        wall = sum(float(layer.thickness) for layer in scene.artery.layers)
-        c = max(float(jnp.max(jnp.asarray(material.c))) for material in materials)
-        bulk = max(float(jnp.max(jnp.asarray(material.bulk))) for material in materials)
-        return Ease(
-            bulk=min(1.0, EASY_BULK * c / bulk),
-            contact=min(1.0, EASY_CONTACT * c / (float(scene.contact.stiffness) * wall)),
-        )
+        return descend_eased(self.system, start, step, ease_of(self.model.scene))
 
     def error(self, stage: str, last: Equilibrium, failure: NotConverged) -> EquilibriumError:
         """The sentence for a user, with the last load that did converge."""
