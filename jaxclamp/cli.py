@@ -129,7 +129,7 @@ def top(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    pass
+    """Clamping of arteries by finite elements."""
 
 
 @app.command()

@@ -20,6 +20,7 @@ class Mesh:
     """Topology of a block. Cells are ordered layer by layer from inside to outside."""
 
     element: Element = static()
+    """of all cells"""
     grid: tuple[int, int, int] = static()
     """nodes along (radial, circumferential, axial)"""
     wraps: bool = static(default=False)
@@ -45,10 +46,12 @@ class Mesh:
 
     @property
     def n_nodes(self) -> int:
+        """Number of nodes."""
         return math.prod(self.grid)
 
     @property
     def n_cells(self) -> int:
+        """Number of cells."""
         return self.cells.shape[1]
 
     def node(self, radial: int, circumferential: int, axial: int) -> int:

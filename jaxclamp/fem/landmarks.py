@@ -35,7 +35,9 @@ class Landmarks:
     layer_names: tuple[str, ...] = static()
     """from inside to outside"""
     element: Element = static()
+    """of the mesh"""
     symmetry: Symmetry = static()
+    """the mirror planes in use"""
 
     def layer(self, name: str) -> int:
         """Number of a layer. Raises KeyError."""

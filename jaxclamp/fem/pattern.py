@@ -22,7 +22,9 @@ class Pattern:
     """Upper triangle (with diagonal) of the symmetric tangent, by compressed rows."""
 
     indptr: np.ndarray
+    """place of each row's first entry, (n + 1,)"""
     indices: np.ndarray
+    """column of each entry, (n_nonzeros,)"""
 
     @property
     def n(self) -> int:
@@ -55,6 +57,7 @@ class Layout:
     free: np.ndarray
     """degree of freedom 3 node + component of each unknown, (n_free,)"""
     n_nodes: int = static()
+    """nodes of all bodies"""
     n_nonzeros: int = static()
     """entries of the sparse tangent"""
 

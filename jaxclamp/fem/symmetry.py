@@ -19,6 +19,7 @@ class Symmetry:
     """The mirror planes that a model makes use of, by the letters of their normals."""
 
     planes: str
+    """letters such as "xyz", "" for none"""
 
     def __contains__(self, axis: str) -> bool:
         return axis in self.planes

@@ -17,7 +17,9 @@ class Equilibria:
     """A scene's potential and its equilibria in order; what measures, stops and figures look at."""
 
     potential: Potential
+    """with every term, at the scene's pressure"""
     marks: Landmarks
+    """where figures are read"""
     states: tuple[State, ...]
     """in the body, then closing; the last is the one asked about"""
     known_stresses: tuple[tuple[Stresses, ...], ...] | None = None

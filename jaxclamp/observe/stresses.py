@@ -49,7 +49,9 @@ class Stresses:
     """Stress at the quadrature points, kPa, each (n_q, n_cells)."""
 
     circumferential: Array
+    """along the deformed image of the circumferential line"""
     axial: Array
+    """along the artery's axis"""
     radial: Array
     """along the deformed image of the radial line"""
     greatest: Array

@@ -22,6 +22,7 @@ class Jaw(abc.ABC):
     """A rigid jaw. A shape is one record with its floats, and `gap`."""
 
     shape: str
+    """name in scene files"""
 
     @abc.abstractmethod
     def gap(self, point: Vector) -> Array:

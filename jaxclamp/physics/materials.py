@@ -27,8 +27,11 @@ class Material(abc.ABC):
     """
 
     law: str
+    """name in scene files"""
     c: Array
+    """shear modulus, kPa"""
     bulk: Array
+    """bulk modulus, kPa"""
 
     @abc.abstractmethod
     def psi_bar(self, F: Tensor) -> Array:

@@ -21,6 +21,7 @@ class Body:
     """A block of cells with a law for each of its layers."""
 
     mesh: Mesh
+    """its cells and facets"""
     X: Array
     """stress-free position of each cell's nodes, mm, (3, n_en, n_cells)"""
     axes: Array

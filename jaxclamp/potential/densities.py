@@ -90,7 +90,9 @@ class Touch:
     """Contact of the outer wall with one jaw."""
 
     jaw: Jaw
+    """its shape"""
     contact: Contact
+    """its law"""
     dA: Array
     """stress-free outer area of a point, mm^2, (n_q, n_facets)"""
     rule: FacetRule
@@ -119,6 +121,7 @@ class Meeting:
     """Contact of the inner wall with the opposite one, in the plane between them."""
 
     contact: Contact
+    """its law"""
     dA: Array
     """stress-free area of a point of the lumen's surface, mm^2, (n_q, n_facets)"""
     plane: Array

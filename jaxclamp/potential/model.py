@@ -36,12 +36,17 @@ class Discretisation:
     """What a scene's static choices alone decide: integers and fixed fractions, no physics."""
 
     mesh: Mesh
+    """of the modelled part"""
     stencils: Stencils
+    """of its element"""
     layout: Layout
+    """of the unknowns"""
     regions: dict[str, Region]
+    """where terms live, by name"""
     sides: dict[str, np.ndarray]
     """facets of the upper and (where it is modelled) the lower half"""
     marks: Landmarks
+    """where figures are read"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +54,11 @@ class Model:
     """A scene made ready to compute with."""
 
     scene: Scene
+    """what it was made of"""
     discretisation: Discretisation
+    """of its static choices"""
     pattern: Pattern
+    """of the sparse tangent"""
     potential: Potential
     """with every term, needed or not: derivatives see them all"""
 

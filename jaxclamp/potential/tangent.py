@@ -67,13 +67,19 @@ class Piece:
     """The cells of one block of a group, cut out of potential and state; it knows no names."""
 
     stencil: Array
+    """(n_q, n_c, n_en)"""
     x: Array
     """current position of the nodes, mm, (n_en, 3, n_cells)"""
     q: Array
+    """rigid coordinates, mm, (n_q,)"""
     densities: tuple[Density, ...] = static()
+    """of the terms"""
     heres: tuple[Any, ...]
+    """what each knows of the points"""
     moved: bool = static()
+    """a density depends on q"""
     pressures: Pressures | None
+    """None where cells need not keep their volume"""
 
 
 @record
@@ -89,6 +95,7 @@ class Linearised:
     missing_force: Array | None = None
     """what condensing the pressures adds to the force, mN, (n_en, 3, n_cells)"""
     volume_error: Array | None = None
+    """largest |mean J - 1 - p / bulk| of a cell"""
     J_range: Array | None = None
     """smallest and largest volume ratio, (2,)"""
     rigid_slope: Array | None = None
@@ -123,7 +130,9 @@ class Linearisation:
     rigid_stiffness: Array
     """d2 Pi/dq2, mN/mm, (n_q, n_q)"""
     J_min: Array
+    """smallest volume ratio at a point"""
     J_max: Array
+    """largest volume ratio at a point"""
 
     @property
     def jaw_force(self) -> Array:

@@ -49,8 +49,11 @@ class Term:
     name: str = static()
     """as shown to users"""
     region: str = static()
+    """such as "layer 0" or "upper outside" of the mesh"""
     stencil: str = static()
+    """what it looks at there, see `build_potential`"""
     density: Density = static()
+    """uJ at the points, see `densities`"""
     here: Any
     """what the density knows of its points; in a group of several blocks, arrays of two or more axes have
     the cells last"""
@@ -66,8 +69,11 @@ class Volume:
     """
 
     name: str = static()
+    """as shown to users"""
     region: str = static()
+    """that of its solid"""
     stencil: str = static()
+    """that of its solid"""
     cells: tuple[int, int] = static()
     """first and last-plus-one among the pressures of a state"""
     stiffness: Array
@@ -79,14 +85,19 @@ class Group:
     """Terms on the same points."""
 
     region: str = static()
+    """where they live"""
     nodes: np.ndarray
     """(n_en, n_cells)"""
     blocks: tuple[tuple[int, int], ...] = static()
+    """first and last-plus-one cell of each piece"""
     slots: tuple[np.ndarray, ...]
+    """where the matrices of each piece go, see `fem.pattern.Region`"""
     stencil: Array
     """(n_q, n_c, n_en)"""
     terms: tuple[Term, ...]
+    """differentiated together"""
     volume: Volume | None
+    """None where cells need not keep their volume"""
     modes: Array | None
     """of the pressure, (n_m, n_q); None without `volume`"""
 
@@ -107,7 +118,9 @@ class Potential:
     """The sum of all terms, and how its unknowns are numbered."""
 
     groups: tuple[Group, ...]
+    """summed up"""
     layout: Layout
+    """numbers of the unknowns"""
 
     def of(self, name: str) -> tuple[Group, ...]:
         """The groups with a term of that name, such as "jaw contact": one for each jaw modelled."""
@@ -189,10 +202,15 @@ class Made:
     """A scene's wall on its mesh, ready for terms."""
 
     artery: Artery
+    """of the scene"""
     clamp: Clamp
+    """of the scene"""
     contact: Contact
+    """of the scene"""
     body: Body
+    """the wall"""
     stencils: Stencils
+    """of its element"""
     sides: dict[str, np.ndarray]
     """facets of each half of the circumference that is modelled, by its name in `SIDES`"""
 
@@ -204,6 +222,7 @@ class Kind:
     reasons: Callable[[Scene], dict[str, str]]
     """name of each term -> why it is there; terms that the scene does not need are left out"""
     terms: Callable[[Made], Iterator[Term | Volume]]
+    """for a discretised scene"""
     of_the_clamp: str | None = None
     """the term's name, if it is only there while the jaws close"""
 

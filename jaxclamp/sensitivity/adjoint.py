@@ -42,6 +42,7 @@ class Sizes:
     data: Any
     """the floats of the terms, see `Potential.data`"""
     stop: Stop
+    """with its target"""
     x_body: Array
     """positions in the body, mm, (n_nodes, 3)"""
     x_stop: Array

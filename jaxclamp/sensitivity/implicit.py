@@ -182,7 +182,9 @@ class Solution:
     """A solution of the equations and what its linear systems are made of; NumPy throughout."""
 
     u: Unknowns
+    """the unknowns"""
     solvers: LinearSolvers
+    """that hold factors"""
     tangents: tuple[np.ndarray, np.ndarray | None]
     """values of K_0 and K_1, mN/mm"""
     responses: np.ndarray

@@ -44,12 +44,15 @@ class Block:
     """A body with held nodes, ready to compute with."""
 
     body: Body
+    """cells, laws, stress-free positions"""
     held: np.ndarray
     """degrees of freedom that go where they are told to, (n_nodes, 3)"""
     positions: np.ndarray
     """stress-free position of the nodes, mm, (n_nodes, 3)"""
     potential: Potential
+    """its terms"""
     pattern: Pattern
+    """of the sparse tangent"""
 
     @property
     def mesh(self) -> Mesh:

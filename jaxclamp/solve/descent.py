@@ -80,7 +80,9 @@ class Ease:
     """How much softer the penalties are made to find a way: factors of at most 1."""
 
     bulk: float
+    """of the bulk modulus"""
     contact: float
+    """of the contact stiffness"""
 
     def potential(self, potential: Potential, share: float) -> Potential:
         """The potential with its penalties eased by a share (1 fully, 0 not at all) of the way, in powers."""

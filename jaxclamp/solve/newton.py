@@ -48,8 +48,11 @@ class Step:
     """A point of a load path."""
 
     closing: Condition
+    """what the jaw is to do"""
     pressure: float
+    """kPa"""
     axial_stretch: float
+    """length over load-free length"""
 
 
 Path = Callable[[float], Step]
@@ -61,10 +64,13 @@ class Equilibrium:
     """A converged state with its loads and what was seen on the way."""
 
     state: State
+    """positions, pressures, rigid coordinates"""
     pressure: float
     """blood pressure, kPa"""
     axial_stretch: float
+    """length over load-free length"""
     lin: Linearisation
+    """forces and tangent there"""
     negative_pivots: int | None
     """of the tangent at a held jaw; more than 0: unstable without the stop; None: back end cannot tell"""
     force_slope: float
@@ -73,6 +79,7 @@ class Equilibrium:
     """change of the free unknowns to remove the residual, and per unit of each rigid coordinate,
     (n_free, 1 + n_q)"""
     iterations: int
+    """that it took"""
     snapped: bool = False
     """reached by following the potential downhill past a loss of stability"""
 
@@ -84,17 +91,25 @@ class System:
     potential: Potential
     """the terms in use"""
     solver: LinearSolver
+    """of its linear systems"""
     tolerance: float
+    """largest residual over the norm of the support reactions"""
     length: float
     """lumen radius, mm: the scale of moves"""
     diagonal: np.ndarray
     """place of each diagonal entry in the values of the tangent, (n_free,)"""
     newton_iterations: int = 0
+    """so far"""
     load_steps: int = 0
+    """so far"""
     assembly_seconds: float = 0.0
+    """so far"""
     first_seconds: float = 0.0
+    """of the first assembly, with its compilation"""
     linearisations: int = 0
+    """so far"""
     patience: int = MAX_LINEARISATIONS
+    """linearisations after which it gives up"""
 
     def be_patient(self) -> None:
         """Allow as many assemblies from here as a clamping may need."""

@@ -34,7 +34,9 @@ class Kept:
     """One converged state and what was read off it."""
 
     stage: str
+    """load-free, physiological or clamping"""
     equilibrium: Equilibrium
+    """the state and its tangent"""
     values: dict[str, Any]
     """as in result.json: floats, and one dict per layer for peaks"""
 
@@ -49,6 +51,7 @@ class LinearSolvers:
     """Solvers that hold the factors of a clamping: those of the last state, and room for the first's."""
 
     stop: LinearSolver
+    """with the factors of the last state"""
     physiological: LinearSolver
     """unused until a derivative asks for it"""
 
@@ -66,12 +69,17 @@ class Result:
     """Every converged state of a clamping."""
 
     model: Model
+    """the scene made ready"""
     states: tuple[Kept, ...]
     """load-free, physiological, then closing, in order"""
     failure: EquilibriumError | None
+    """why the stop was not reached; None if it was"""
     solver: dict[str, Any]
+    """counts and checks, as in result.json"""
     cost: dict[str, Any]
+    """times and memory, as in result.json"""
     linear_solvers: LinearSolvers = dataclasses.field(repr=False)
+    """with factors for derivatives"""
     errors: dict[str, dict[str, float | None]] | None = None
     """how far the main figures may be off, see `jaxclamp.trust.estimates`; None if it was not asked for"""
 
@@ -104,6 +112,7 @@ class Result:
 
     @property
     def scene(self) -> Scene:
+        """The scene that was solved."""
         return self.model.scene
 
     @property
@@ -116,10 +125,12 @@ class Result:
 
     @property
     def load_free(self) -> Kept | None:
+        """The state without loads; None if it did not converge."""
         return next(iter(self._stage("load-free")), None)
 
     @property
     def physiological(self) -> Kept | None:
+        """The state in the body; None if it did not converge."""
         return next(iter(self._stage("physiological")), None)
 
     @property

@@ -36,6 +36,7 @@ class Held:
     """The jaw stays at a height, mm."""
 
     height: float
+    """of the jaw's lowest point above the axis, mm"""
 
     def row(self, state: State, n_free: int) -> Row:
         """The condition at a state."""
@@ -48,6 +49,7 @@ class Until:
     """The jaw moves until the measure of a stop has a value."""
 
     stop: Stop
+    """with the measure"""
     target: float
     """internal units"""
     equilibria: Equilibria

@@ -52,9 +52,13 @@ class Rung:
     """One variant of a scene."""
 
     group: str
+    """what is varied"""
     setting: str
+    """and how, in words"""
     scene: Scene
+    """with that choice"""
     single_precision: bool = False
+    """judge the forces of float32 instead of solving"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,12 +66,19 @@ class Price:
     """What a variant gave, and what it cost; `figures` is None where it has no solution."""
 
     group: str
+    """what is varied"""
     setting: str
+    """and how, in words"""
     figures: dict[str, float] | None
+    """by key, in the key's unit"""
     failure: str | None = None
+    """why there are none"""
     elements: int = 0
+    """of the modelled part"""
     unknowns: int = 0
+    """of the linear systems"""
     newton_iterations: int = 0
+    """of the whole path"""
     seconds: float = math.nan
     """one clamping, compiled"""
     memory_MB: float | None = None
@@ -220,7 +231,9 @@ class Limit:
     """A figure extrapolated to an infinitely fine mesh."""
 
     value: float
+    """in the figure's unit"""
     order: float
+    """of convergence"""
     believed: bool
     """the order was found from three meshes; otherwise it is the element's"""
     spread: float
@@ -245,10 +258,13 @@ class PriceList:
     """Every variant with its errors."""
 
     title: str
+    """of the scene"""
     layer: str
     """name of the layer of P"""
     prices: list[Price]
+    """of every variant"""
     limits: dict[str, Limit]
+    """by key of the figure"""
     exact: dict[str, float]
     """the reference: extrapolated over meshes, less what the penalties add"""
     sources: dict[str, dict[str, float | None]]
