@@ -9,6 +9,7 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxclamp.core.failures import EquilibriumError, SceneError  # noqa: E402
 from jaxclamp.core.progress import Progress  # noqa: E402
+from jaxclamp.core.records import UNIT_FACTOR  # noqa: E402
 from jaxclamp.observe.measures import (  # noqa: E402
     Measure,
     axial_stress_at_P,
@@ -29,14 +30,20 @@ from jaxclamp.observe.measures import (  # noqa: E402
     stored_energy,
     volume_above,
 )
-from jaxclamp.scenes.files import dump_scene, load_scene  # noqa: E402
+from jaxclamp.scenes.files import dump_scene, load_scene, read_text, require_possible  # noqa: E402
+from jaxclamp.scenes.presets import did_you_mean  # noqa: E402
 from jaxclamp.scenes.scene import Scene, replace  # noqa: E402
+from jaxclamp.scenes.schema import file_key, shown, toml_value  # noqa: E402
 from jaxclamp.sensitivity.adjoint import value_and_gradient  # noqa: E402
 from jaxclamp.sensitivity.gradients import gradients  # noqa: E402
 from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
 from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
+from jaxclamp.solve.linear_solvers import cores  # noqa: E402
+from jaxclamp.solve.results import versions  # noqa: E402
+from jaxclamp.trust.estimates import with_errors  # noqa: E402
 
 __all__ = [
+    "UNIT_FACTOR",
     "EquilibriumError",
     "Measure",
     "Progress",
@@ -47,8 +54,11 @@ __all__ = [
     "circumferential_stress_at_P",
     "clamp",
     "clamp_force",
+    "cores",
+    "did_you_mean",
     "dump_scene",
     "evaluate",
+    "file_key",
     "gradients",
     "jaw_curvature",
     "jaw_half_width",
@@ -59,12 +69,18 @@ __all__ = [
     "lumen_width",
     "mean_contact_pressure",
     "physiological_lumen_radius",
+    "read_text",
     "replace",
+    "require_possible",
+    "shown",
     "smooth_peak_axial_stress",
     "smooth_peak_circumferential_stress",
     "smooth_peak_contact_pressure",
     "smooth_peak_principal_stress",
     "stored_energy",
+    "toml_value",
     "value_and_gradient",
+    "versions",
     "volume_above",
+    "with_errors",
 ]
