@@ -31,12 +31,15 @@ from jaxclamp.observe.measures import (  # noqa: E402
 )
 from jaxclamp.observe.stops import ForceStop, OcclusionStop, TravelStop  # noqa: E402
 from jaxclamp.scenes.address import replace  # noqa: E402
-from jaxclamp.scenes.files import dump_scene, load_scene  # noqa: E402
+from jaxclamp.scenes.files import dump_scene, load_scene, require_possible  # noqa: E402
 from jaxclamp.scenes.scene import Scene  # noqa: E402
 from jaxclamp.sensitivity.adjoint import value_and_gradient  # noqa: E402
 from jaxclamp.sensitivity.gradients import gradients  # noqa: E402
 from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
 from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
+from jaxclamp.solve.linear_solvers import cores  # noqa: E402
+from jaxclamp.solve.results import versions  # noqa: E402
+from jaxclamp.trust.estimates import with_errors  # noqa: E402
 
 __all__ = [
     "EquilibriumError",
@@ -52,6 +55,7 @@ __all__ = [
     "circumferential_stress_at_P",
     "clamp",
     "clamp_force",
+    "cores",
     "dump_scene",
     "evaluate",
     "gradients",
@@ -65,11 +69,14 @@ __all__ = [
     "mean_contact_pressure",
     "physiological_lumen_radius",
     "replace",
+    "require_possible",
     "smooth_peak_axial_stress",
     "smooth_peak_circumferential_stress",
     "smooth_peak_contact_pressure",
     "smooth_peak_principal_stress",
     "stored_energy",
     "value_and_gradient",
+    "versions",
     "volume_above",
+    "with_errors",
 ]

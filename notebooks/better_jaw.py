@@ -52,7 +52,7 @@ problem = DesignProblem(
 )
 
 # %%
-from optimize.problem import gradients
+from optimize.evaluator import gradients
 
 _, slopes = gradients(problem, result)
 h = 1e-4

@@ -4,8 +4,8 @@ A `DesignProblem` says what may change (any floats of a scene), what is minimise
 hold (measures of `jaxclamp`); `minimise` finds the best design with a driver from a well-known library.
 """
 
-from optimize.parameters import Variable
 from optimize.problem import Constraint, DesignProblem
 from optimize.study import Study, minimise
+from optimize.variables import Variable
 
 __all__ = ["Constraint", "DesignProblem", "Study", "Variable", "minimise"]

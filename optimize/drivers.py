@@ -26,16 +26,19 @@ class Target:
     """What a driver sees: a function over the unit box."""
 
     start: np.ndarray
+    """(n,), each from 0 to 1"""
     objective: Callable[[np.ndarray], tuple[float, np.ndarray]]
-    """value and gradient"""
+    """value and gradient, (n,)"""
     margins: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     """what has to be at least 0, (n_margins,), and its derivatives, (n_margins, n)"""
     n_margins: int
+    """0: no constraints"""
     tolerance: float
     """change of the objective that no longer matters"""
 
 
 Driver = Callable[[Target], str]
+"""works on a target until it is content; returns why it stopped"""
 
 
 def slsqp(target: Target) -> str:
@@ -147,9 +150,10 @@ class Method:
     constrained: bool
 
 
-METHODS = {
+METHODS: dict[str, Method] = {
     "slsqp": Method(slsqp, constrained=True),
     "l-bfgs-b": Method(l_bfgs_b, constrained=False),
     "mma": Method(mma, constrained=True),
     "adam": Method(adam, constrained=False),
 }
+"""what a study may name as its method"""

@@ -29,7 +29,8 @@ from jaxclamp.show.plots.style import (
     plain,
     stress_colours,
 )
-from optimize.study import FEASIBLE, Study
+from optimize.record import FEASIBLE
+from optimize.study import Study
 
 COLOURS = {"reference": FAINT, "start": CIRCUMFERENTIAL, "best": AXIAL}
 

@@ -16,6 +16,7 @@ from jaxclamp import SceneError
 from jaxclamp.show.console import as_json
 
 STUDY, ITERATIONS, LOCK = "study.json", "iterations.csv", ".study.lock"
+"""names of the files in a study's folder"""
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -13,7 +13,8 @@ from jaxclamp.show.plots import Plate, png
 from jaxclamp.show.report import document, figure_section, number, section, table
 from optimize.figures import figures, shown
 from optimize.journal import write_bytes, write_whole
-from optimize.study import FEASIBLE, Study
+from optimize.record import FEASIBLE
+from optimize.study import Study
 
 ROWS = (
     ("peak_axial_stress_kPa", "peak axial stress"),

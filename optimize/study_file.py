@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from jaxclamp import Progress, Scene, SceneError, load_scene
-from jaxclamp.core.records import UNIT_FACTOR
-from jaxclamp.scenes import schema
+from jaxclamp.scenes.address import describe
 from jaxclamp.scenes.files import read_text
-from jaxclamp.scenes.presets import did_you_mean
+from jaxclamp.scenes.schema import shown, toml_value
+from jaxclamp.scenes.wording import did_you_mean
 from optimize.drivers import METHODS
-from optimize.objectives import read_measure
-from optimize.parameters import Variable, resolve
+from optimize.named_measures import read_measure
 from optimize.problem import Constraint, DesignProblem
 from optimize.study import Study, minimise
+from optimize.variables import Variable
 
 KEYS = (
     "title",
@@ -33,6 +33,7 @@ KEYS = (
     "variables",
     "constraints",
 )
+"""what a study file may set"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +41,7 @@ class StudyFile:
     """What a study file asks for."""
 
     title: str
+    """of the report"""
     problem: DesignProblem
     method: str
     max_evaluations: int
@@ -111,7 +113,7 @@ def _scenes(table: dict[str, Any], folder: Path) -> tuple[Scene, Scene]:
     """The scene as it is, and with the jaw to start from."""
     name = table.get("scene")
     if not isinstance(name, str):
-        raise SceneError(f"scene = {schema.shown(name)}: expected a preset or a scene file")
+        raise SceneError(f"scene = {shown(name)}: expected a preset or a scene file")
     beside = folder / name
     scene: str | Path = beside if Path(name).suffix == ".toml" else name
     changes = table.get("set", [])
@@ -123,7 +125,7 @@ def _scenes(table: dict[str, Any], folder: Path) -> tuple[Scene, Scene]:
     start = table["start"]
     if not isinstance(start, dict) or set(start) != {"jaw"}:
         raise SceneError("start: expected a table with jaw = a jaw's name or table")
-    return reference, load_scene(scene, [*changes, f"clamp.jaw={schema.toml_value(start['jaw'])}"])
+    return reference, load_scene(scene, [*changes, f"clamp.jaw={toml_value(start['jaw'])}"])
 
 
 def _tables(table: dict[str, Any], key: str) -> list[Any]:
@@ -139,8 +141,7 @@ def _variable(item: Any, scene: Scene, path: str) -> Variable:
     for name in item:
         if name not in ("key", "lower", "upper"):
             raise SceneError(f"unknown key {path}.{name}; {did_you_mean(name, ['key', 'lower', 'upper'])}")
-    _, _, interval = resolve(scene, item["key"])
-    factor = UNIT_FACTOR[interval.unit]
+    factor = describe(scene, item["key"]).factor
 
     def bound(side: str) -> tuple[float, ...] | None:
         if side not in item:
@@ -164,26 +165,26 @@ def _number(value: Any, path: str, least: float, most: float) -> float:
     good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     if not good or not least <= value <= most:
         where = f" from {least:g} to {most:g}" if math.isfinite(least) else ""
-        raise SceneError(f"{path} = {schema.shown(value)}: expected a number{where}")
+        raise SceneError(f"{path} = {shown(value)}: expected a number{where}")
     return float(value)
 
 
 def _whole(table: dict[str, Any], key: str, default: int, least: int, most: int) -> int:
     value = table.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise SceneError(f"{key} = {schema.shown(value)}: expected a whole number from {least} to {most}")
+        raise SceneError(f"{key} = {shown(value)}: expected a whole number from {least} to {most}")
     return value
 
 
 def _choice(table: dict[str, Any], key: str, default: str, choices: tuple[str, ...]) -> str:
     value = table.get(key, default)
     if value not in choices:
-        raise SceneError(f"{key} = {schema.shown(value)}: expected one of {', '.join(choices)}")
+        raise SceneError(f"{key} = {shown(value)}: expected one of {', '.join(choices)}")
     return str(value)
 
 
 def _text(table: dict[str, Any], key: str, default: str) -> str:
     value = table.get(key, default)
     if not isinstance(value, str) or not value.isprintable():
-        raise SceneError(f"{key} = {schema.shown(value)}: expected a text on one line")
+        raise SceneError(f"{key} = {shown(value)}: expected a text on one line")
     return value

@@ -33,6 +33,7 @@ class Verification:
     failure: str | None
     """why start or best has no equilibrium there"""
     elements: int
+    """of the finer mesh"""
 
     @property
     def gain_before(self) -> float:

@@ -19,14 +19,15 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
+from jaxclamp.core.failures import NotConverged
 from optimize import Constraint, DesignProblem, Variable, minimise
 from optimize.drivers import METHODS, Enough, Target
+from optimize.evaluator import evaluate, gradients
 from optimize.journal import Journal, write_whole
-from optimize.objectives import named
-from optimize.parameters import entries, with_design
-from optimize.problem import evaluate, gradients
-from optimize.study import other_starts
+from optimize.named_measures import named
+from optimize.starts import other_starts
 from optimize.study_file import load_study
+from optimize.variables import entries, with_design
 from optimize.verification import finer
 
 SMALL = ["mesh.circumferential=6", "mesh.axial=16", "mesh.radial=[2, 1]", "stop.occlusion=0.9"]
@@ -221,19 +222,19 @@ def test_a_constraint_is_active_at_the_optimum():
 
 def test_a_failing_design_is_backed_off_from(monkeypatch):
     """A design injected to fail is logged, is not the best, and does not end the study."""
-    import optimize.problem
+    import optimize.evaluator
 
-    solve = optimize.problem.clamp
+    solve = optimize.evaluator.clamp
     met = []
 
     def fails_below(asked, **options):
         if 0.9 < float(asked.clamp.jaw.slopes[0]) < 1.15:
             met.append(float(asked.clamp.jaw.slopes[0]))
-            failure = jc.equilibrium.NotConverged("injected")
+            failure = NotConverged("injected")
             raise jc.EquilibriumError("clamping", "somewhere", failure, "try something else")
         return solve(asked, **options)
 
-    monkeypatch.setattr(optimize.problem, "clamp", fails_below)
+    monkeypatch.setattr(optimize.evaluator, "clamp", fails_below)
     study = minimise(one_slope(), max_evaluations=30, check_finer_mesh=False)
     failed = [e for e in study.evaluations if e.failure is not None]
     assert len(failed) == len(met) >= 1
@@ -244,16 +245,16 @@ def test_a_failing_design_is_backed_off_from(monkeypatch):
 
 def test_a_state_that_a_cold_solution_does_not_find_is_no_design(monkeypatch):
     """The recorded best is made to disagree with its solution from scratch."""
-    import optimize.study
+    import optimize.evaluator
 
-    measured = optimize.study.evaluate
+    measured = optimize.evaluator.evaluate
 
     def flattered(problem, design, near):
         found, result = measured(problem, design, near)
         wrong = abs(design[0] - 0.27) < 0.06 and found.failure is None
         return (dataclasses.replace(found, values=0.5 * found.values) if wrong else found), result
 
-    monkeypatch.setattr(optimize.study, "evaluate", flattered)
+    monkeypatch.setattr(optimize.evaluator, "evaluate", flattered)
     study = minimise(one_slope(), max_evaluations=12, check_finer_mesh=False)
     lied = [e for e in study.evaluations if abs(e.design[0] - 0.27) < 0.06]
     assert lied

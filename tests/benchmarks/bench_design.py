@@ -14,7 +14,7 @@ import pytest
 
 import jaxclamp as jc
 from optimize import DesignProblem, Variable
-from optimize.problem import gradients
+from optimize.evaluator import gradients
 
 pytestmark = pytest.mark.benchmark
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import jaxclamp as jc
 from jaxclamp import Measure, SceneError
-from jaxclamp.scenes.presets import did_you_mean
+from jaxclamp.scenes.wording import did_you_mean
 
 FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
 """internal unit -> unit in files, and internal units in one of it; the others are the same"""
@@ -32,6 +32,7 @@ FACTORIES: tuple[Callable[..., Measure], ...] = (
     jc.jaw_curvature,
     jc.jaw_half_width,
 )
+"""the measures of `jaxclamp` that a file can name"""
 
 _EXAMPLE: dict[str, Any] = {"layer": "media", "stress": 1.0}
 _KINDS: dict[str, Any] = {"layer": (str, "the name of a layer"), "stress": ((int, float), "a stress in kPa")}
@@ -42,12 +43,15 @@ class Named:
     """A measure as a file names it."""
 
     key: str
+    """name and unit, such as "clamp_force_N"""
     factory: Callable[..., Measure]
+    """makes the measure from its arguments"""
     factor: float
     """internal units in one unit of the file"""
 
     @property
     def arguments(self) -> tuple[str, ...]:
+        """Further keys that the file has to give, such as ("layer",)."""
         return tuple(inspect.signature(self.factory).parameters)
 
 

@@ -1,0 +1,131 @@
+"""Where designs start: the problem's own scene, and others drawn between the bounds.
+
+Other starts are studies of their own, each in a process and a folder of its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+from jaxclamp import EquilibriumError, Progress, Result, Scene, SceneError, cores, require_possible
+from optimize.drivers import METHODS, Enough
+from optimize.evaluator import Evaluator
+from optimize.journal import Journal
+from optimize.problem import DesignProblem
+from optimize.record import Evaluation, Record
+
+MOST_DRAWS = 64
+"""rounds of eight draws in which other starts that make sense are looked for"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """How a driver is to work, and how long."""
+
+    method: str
+    """a key of `optimize.drivers.METHODS`"""
+    max_evaluations: int
+    """on record, those of an earlier run among them"""
+    tolerance: float
+    """relative change of the objective that no longer matters"""
+
+
+def drive(
+    record: Record, budget: Budget, journal: Journal | None, tell: Callable[[Progress], Any]
+) -> tuple[Result | None, str]:
+    """Let the driver work until it is content or the budget is spent; the record grows.
+
+    Returns the solution of the start design (None if that was on record) and why the driver ended.
+    Raises EquilibriumError or SceneError if the start has no equilibrium, OSError from the journal.
+    """
+    evaluator = Evaluator(record, journal, budget.max_evaluations, tell)
+    try:
+        stopped = METHODS[budget.method].drive(evaluator.target(budget.tolerance))
+    except Enough:
+        stopped = f"{budget.max_evaluations} evaluations"
+    return evaluator.first, stopped
+
+
+def is_possible(scene: Scene) -> bool:
+    """True unless a scene file with these values would be refused."""
+    try:
+        require_possible(scene)
+    except SceneError:
+        return False
+    return True
+
+
+def other_starts(problem: DesignProblem, count: int) -> list[np.ndarray]:
+    """At most `count` designs (n_variables,) that make sense, spread over the box, internal units.
+
+    A scrambled Sobol' sequence with a fixed seed: the same designs every time.
+    """
+    lower, upper = problem.bounds
+    draws = scipy.stats.qmc.Sobol(lower.size, rng=np.random.default_rng(0))
+    found: list[np.ndarray] = []
+    for _ in range(MOST_DRAWS):
+        for t in draws.random(8):
+            # half way to the start: the box's corners are seldom sensible
+            design = 0.5 * (problem.start + lower + t * (upper - lower))
+            if is_possible(problem.scene_at(design)):
+                found.append(design)
+        if len(found) >= count:
+            break
+    return found[:count]
+
+
+@contextmanager
+def elsewhere(
+    problem: DesignProblem, budget: Budget, count: int, folder: Path | None, resume: bool
+) -> Iterator[list[Future[list[Evaluation]]]]:
+    """Studies from `count` other starts in processes of their own; ended with the block if it fails.
+
+    folder: the journals are kept in its subfolders start-2, start-3 and so on; None: nowhere
+    """
+    if count < 1:
+        yield []
+        return
+    pool = ProcessPoolExecutor(min(count, cores()), mp_context=multiprocessing.get_context("spawn"))
+    try:
+        yield [
+            pool.submit(
+                from_another_start,
+                dataclasses.replace(problem, scene=problem.scene_at(design)),
+                budget,
+                None if folder is None else folder / f"start-{number}",
+                resume,
+            )
+            for number, design in enumerate(other_starts(problem, count), 2)
+        ]
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def from_another_start(
+    problem: DesignProblem, budget: Budget, folder: Path | None, resume: bool
+) -> list[Evaluation]:
+    """The evaluations of a study of its own from the problem's scene; none if that has no equilibrium.
+
+    Raises OSError if its folder cannot be written.
+    """
+    record = Record(problem, budget.method, [])
+    journal = None if folder is None else Journal(folder, resume)
+    try:
+        if journal is not None and journal.found:
+            record.read(journal.found)
+        drive(record, budget, journal, lambda event: None)
+    except (EquilibriumError, SceneError):
+        return []
+    finally:
+        if journal is not None:
+            journal.close()
+    return record.evaluations

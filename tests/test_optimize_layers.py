@@ -1,0 +1,225 @@
+"""`optimize` stands on public names of `jaxclamp`, and its imports point down only.
+
+A new module gets a line in `LEVEL`.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxclamp
+
+ROOT = Path(__file__).parents[1]
+
+LEVEL = {
+    "drivers": 0,
+    "journal": 0,
+    "named_measures": 0,
+    "variables": 0,
+    "problem": 1,
+    "record": 2,
+    "verification": 2,
+    "evaluator": 3,
+    "starts": 4,
+    "study": 5,
+    "figures": 6,
+    "study_file": 6,
+    "report": 7,
+    "__init__": 8,
+}
+
+MODULES = sorted(path.stem for path in (ROOT / "optimize").rglob("*.py"))
+
+# what only some modules may import
+CONFINED = {
+    "jaxopt": {"drivers"},
+    "nlopt": {"drivers"},
+    "optax": {"drivers"},
+    "scipy.optimize": {"drivers"},
+    "matplotlib": {"figures"},
+}
+
+OPEN_ROOMS = ("jaxclamp.scenes", "jaxclamp.pictures", "jaxclamp.show")
+"""rooms of data and of what is shown, beside the names of jaxclamp itself"""
+MOST_LINES = 400
+
+
+def imported(tree: ast.AST) -> list[tuple[str, str]]:
+    """Module and name of every import, also inside functions; no name where the module itself is imported.
+
+    Of `import jaxclamp as jc`, every `jc.NAME` that is used counts as an import of NAME.
+    """
+    found, aliases = [], {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, "") for alias in node.names]
+            aliases |= {alias.asname or alias.name: alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found += [("." * node.level + (node.module or ""), alias.name) for alias in node.names]
+            aliases |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in aliases:
+            module = aliases[node.value.id]
+            if module.partition(".")[0] in ("jaxclamp", "optimize"):
+                found.append((module, node.attr))
+    return found
+
+
+def faults(name: str, source: str) -> list[str]:
+    """What is wrong with the imports of a module of optimize, one sentence each."""
+    if name not in LEVEL:
+        return [f"optimize/{name}.py has no level: add it to LEVEL in {Path(__file__).name}"]
+    said = [_fault(name, module, what) for module, what in imported(ast.parse(source))]
+    return [sentence for sentence in said if sentence]
+
+
+def _fault(name: str, module: str, what: str) -> str | None:
+    package = module.partition(".")[0]
+    if package == "":
+        return f"{name} imports {module}: write imports in full"
+    if package == "optimize":
+        return _not_below(name, module, what)
+    if package == "jaxclamp":
+        return _not_public(name, module, what)
+    for confined, users in CONFINED.items():
+        whole = f"{module}.{what}" if what else module
+        if f"{whole}.".startswith(f"{confined}.") and name not in users:
+            return f"{name} imports {confined}, which is for {', '.join(sorted(users))}"
+    return None
+
+
+def _not_below(name: str, module: str, what: str) -> str | None:
+    """Why an import from optimize is none that points down to a public name."""
+    target = module.removeprefix("optimize").lstrip(".") or (what if what in LEVEL else "__init__")
+    if target not in LEVEL:
+        return f"{name} imports {module}, which has no level"
+    if LEVEL[target] >= LEVEL[name]:
+        return f"{name} (level {LEVEL[name]}) imports {target} (level {LEVEL[target]}): imports point down"
+    return f"{name} imports {what} of {target}, which is private" if what.startswith("_") else None
+
+
+def _not_public(name: str, module: str, what: str) -> str | None:
+    """Why an import from jaxclamp is none of a public name."""
+    if module == "jaxclamp":
+        known = not what or what in jaxclamp.__all__
+        return None if known else f"{name} imports {what}, which is not in jaxclamp.__all__"
+    if not any(f"{module}.".startswith(f"{room}.") for room in OPEN_ROOMS):
+        return f"{name} imports {module}: take public names from jaxclamp or {', '.join(OPEN_ROOMS)}"
+    private = any(part.startswith("_") for part in (*module.split("."), what))
+    return f"{name} imports {what} of {module}, which is private" if private else None
+
+
+def source(name: str) -> str:
+    return (ROOT / "optimize" / f"{name}.py").read_text(encoding="utf-8")
+
+
+def test_every_level_is_of_a_module():
+    assert set(LEVEL) == set(MODULES)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_point_down_to_public_names(name):
+    assert faults(name, source(name)) == []
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_is_one_idea(name):
+    assert len(source(name).splitlines()) <= MOST_LINES
+    assert ast.get_docstring(ast.parse(source(name)))
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_public_names_say_what_they_are(name):
+    tree = ast.parse(source(name))
+    owners = [tree, *(node for node in tree.body if isinstance(node, ast.ClassDef))]
+    named = [
+        node for owner in owners for node in owner.body if isinstance(node, ast.FunctionDef | ast.ClassDef)
+    ]
+    silent = [node.name for node in named if not node.name.startswith("_") and not ast.get_docstring(node)]
+    assert silent == []
+
+
+def test_jaxopt_is_imported_by_one_module_of_optimize_and_none_of_jaxclamp():
+    def users(package: str) -> list[str]:
+        trees = {path: ast.parse(path.read_text("utf-8")) for path in (ROOT / package).rglob("*.py")}
+        return [
+            path.stem
+            for path, tree in trees.items()
+            if any(module.partition(".")[0] == "jaxopt" for module, _ in imported(tree))
+        ]
+
+    assert users("optimize") == ["drivers"]
+    assert users("jaxclamp") == []
+
+
+@pytest.mark.parametrize("package", ["jaxclamp", "optimize"])
+def test_what_draws_or_optimises_is_imported_when_it_is_needed(package):
+    heavy = ("matplotlib", "jaxopt", "nlopt", "optax", "pyvista", "meshio")
+    found = f"import sys, {package}; sys.exit(' '.join(sorted(set({heavy}) & set(sys.modules))))"
+    done = subprocess.run(
+        [sys.executable, "-c", found], capture_output=True, text=True, cwd=ROOT, timeout=120, check=False
+    )
+    assert (done.returncode, done.stderr.strip()) == (0, "") or done.stderr.strip() == ""
+
+
+@pytest.mark.parametrize("name", sorted(set(jaxclamp.__all__)))
+def test_public_names_of_jaxclamp_exist(name):
+    assert hasattr(jaxclamp, name)
+
+
+# --- the checker itself ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("from optimize.study import Study", "imports point down"),
+        ("from optimize.evaluator import Evaluator", "imports point down"),
+        ("import optimize.study", "imports point down"),
+        ("import optimize", "imports point down"),
+        ("from optimize import minimise", "imports point down"),
+        ("from optimize import study", "imports point down"),
+        ("from optimize.nowhere import thing", "has no level"),
+        ("from optimize.record import _evaluation", "is private"),
+        ("from optimize import record\nrecord._evaluation({})", "is private"),
+        ("from .record import Record", "write imports in full"),
+        ("from jaxclamp.sensitivity.adjoint import value_and_gradient", "take public names"),
+        ("import jaxclamp.solve.clamping", "take public names"),
+        ("from jaxclamp import solve", "not in jaxclamp.__all__"),
+        ("import jaxclamp as jc\njc.solve.clamping.clamp", "not in jaxclamp.__all__"),
+        ("from jaxclamp.show.console import _finite", "is private"),
+        ("from jaxclamp.showroom import lamp", "take public names"),
+        ("import jaxopt", "is for drivers"),
+        ("from scipy.optimize import minimize", "is for drivers"),
+        ("from scipy import optimize", "is for drivers"),
+        ("def f():\n    import nlopt", "is for drivers"),
+    ],
+)
+def test_the_checker_reports(line, said):
+    found = faults("evaluator", line)
+    assert len(found) >= 1, "nothing was reported"
+    assert said in found[0] or said in found[-1]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from jaxclamp import clamp",
+        "import jaxclamp as jc\njc.clamp",
+        "from jaxclamp.show.console import as_json",
+        "from optimize.record import Record",
+        "import scipy.stats",
+        "from scipy import stats",
+    ],
+)
+def test_the_checker_lets_pass(line):
+    assert faults("evaluator", line) == []
+
+
+def test_the_checker_asks_for_a_level():
+    assert "has no level" in faults("attic", "")[0]
