@@ -147,7 +147,9 @@ class Method:
     """A driver, and whether it takes constraints."""
 
     drive: Driver
+    """works on a target, and says why it stopped"""
     constrained: bool
+    """True if it takes constraints"""
 
 
 METHODS: dict[str, Method] = {

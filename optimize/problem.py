@@ -18,8 +18,11 @@ class Constraint:
     """lower <= measure <= upper, in internal units (mm, kPa, mN)."""
 
     measure: Measure
+    """what is bounded"""
     lower: float = -math.inf
+    """internal units"""
     upper: float = math.inf
+    """internal units"""
 
     @property
     def scale(self) -> float:

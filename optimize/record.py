@@ -43,6 +43,7 @@ class Record:
     """The evaluations of a study, in order."""
 
     problem: DesignProblem
+    """what is studied"""
     method: str
     """a key of `optimize.drivers.METHODS`"""
     evaluations: list[Evaluation]

@@ -33,6 +33,7 @@ class Study:
     """What a study found."""
 
     problem: DesignProblem
+    """what was studied"""
     method: str
     """a key of `optimize.drivers.METHODS`"""
     evaluations: tuple[Evaluation, ...]

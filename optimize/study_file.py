@@ -43,9 +43,13 @@ class StudyFile:
     title: str
     """of the report"""
     problem: DesignProblem
+    """scene, variables, objective, constraints"""
     method: str
+    """a key of `drivers.METHODS`"""
     max_evaluations: int
+    """of the start's own study"""
     tolerance: float
+    """relative change of the objective that no longer matters"""
     starts: int
     """designs to start from: the file's, and others drawn between the bounds"""
 

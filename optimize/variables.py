@@ -22,8 +22,11 @@ class Variable:
     """
 
     path: str
+    """as for `jaxclamp.replace`"""
     lower: float | tuple[float, ...] | None = None
+    """internal units"""
     upper: float | tuple[float, ...] | None = None
+    """internal units"""
 
 
 @dataclasses.dataclass(frozen=True)

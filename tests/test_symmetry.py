@@ -18,7 +18,7 @@ COUNTS = ["mesh.circumferential=3", "mesh.axial=5", "mesh.radial=[1, 1]", "mesh.
 
 
 def scene(choice: str, *others: str) -> jc.Scene:
-    return jc.load_scene("human-lad", [*COUNTS, f"mesh.symmetry={choice}", "stop.occlusion=0.8", *others])
+    return jc.load_scene("human-lad", [*COUNTS, f"mesh.symmetry={choice}", "stop.occlusion=0.6", *others])
 
 
 @pytest.fixture(scope="module")

@@ -130,11 +130,11 @@ def settle(
     system = System(block.potential, solver, tolerance, size, block.pattern.diagonal)
     height = OPEN if jaw_height is None else jaw_height
     top = float(np.max(x[:, 1]))
-    found, before = None, x
+    found, way = None, np.where(block.held, np.asarray(moved) - x, 0.0) / steps
+    carried = _carried_along(block, way)
     for number in range(1, steps + 1):
-        share = number / steps
-        target = np.where(block.held, before + share * (np.asarray(moved) - before), x)
-        jaw = height if height == OPEN or steps == 1 else top + share * (height - top)
+        target = x + np.where(block.held, way, carried)
+        jaw = height if height == OPEN else top + number / steps * (height - top)
         state = at_rest(block, target, jaw)
         step = Step(Held(jaw), 0.0, 1.0)
         try:
@@ -144,6 +144,15 @@ def settle(
         x = np.asarray(found.state.x)
     assert found is not None
     return found
+
+
+def _carried_along(block: Block, way: np.ndarray) -> np.ndarray:
+    """How all nodes go if the body follows its held nodes like an affine map, mm, (n_nodes, 3)."""
+    X = np.column_stack([np.ones(len(block.positions)), block.positions])
+    fits = [
+        np.linalg.lstsq(X[held], u[held], rcond=None)[0] for held, u in zip(block.held.T, way.T, strict=True)
+    ]
+    return X @ np.stack(fits, axis=1)
 
 
 def at_rest(block: Block, x: np.ndarray, jaw_height: float = OPEN) -> State:
