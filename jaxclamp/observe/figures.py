@@ -83,9 +83,15 @@ def by_layer(read: Callable[[Equilibria, str], Any]) -> Read:
     return lambda e: {name: read(e, name) for name in e.marks.layer_names}
 
 
-def ratio(value: Array, base: Array) -> Array:
-    """value / base; not a number where the base is zero."""
-    return jnp.where(base == 0.0, jnp.nan, value / jnp.where(base == 0.0, 1.0, base))
+NOISE, NOISE_OF_BULK = 1e-6, 1e-12
+"""a stress below this part of the shear modulus, or of the bulk modulus, is what tolerance and rounding
+leave of none"""
+
+
+def ratio(value: Array, base: Array, noise: Array) -> Array:
+    """value / base; not a number where the base is no more than noise."""
+    nothing = jnp.abs(base) <= noise
+    return jnp.where(nothing, jnp.nan, value / jnp.where(nothing, 1.0, base))
 
 
 # --- shape and contact ------------------------------------------------------------------------------
@@ -138,7 +144,9 @@ def _place_of_axial_peak(e: Equilibria, name: str) -> Array:
 
 def _stress_ratio(component: str) -> Read:
     def read(e: Equilibria) -> Array:
-        return ratio(stress_at_P(e, component), stress_at_P(e.in_body, component))
+        material = e.potential.layers[e.marks.P_layer].terms[0].here.material
+        noise = NOISE * jnp.max(material.c) + NOISE_OF_BULK * jnp.max(material.bulk)
+        return ratio(stress_at_P(e, component), stress_at_P(e.in_body, component), noise)
 
     return read
 

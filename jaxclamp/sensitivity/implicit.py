@@ -39,8 +39,8 @@ from jaxclamp.potential.terms import Potential
 from jaxclamp.scenes.scene import Scene, Stop
 from jaxclamp.sensitivity.worker import call_elsewhere
 from jaxclamp.solve.clamping import clamp, inflate
-from jaxclamp.solve.linear_solvers import LinearSolver
-from jaxclamp.solve.results import LinearSolvers, Result
+from jaxclamp.solve.linear_solvers import Factors
+from jaxclamp.solve.results import Result
 from jaxclamp.solve.stops import stop_residual, stop_row
 
 
@@ -183,8 +183,8 @@ class Solution:
 
     u: Unknowns
     """the unknowns"""
-    solvers: LinearSolvers
-    """that hold factors"""
+    factors: Factors
+    """of its tangents"""
     tangents: tuple[np.ndarray, np.ndarray | None]
     """values of K_0 and K_1, mN/mm"""
     responses: np.ndarray
@@ -209,7 +209,7 @@ def solution(result: Result, to_stop: bool) -> Solution:
     n_q, n = coupling.shape[::-1]
     return Solution(
         u=u,
-        solvers=result.linear_solvers,
+        factors=result.factors,
         tangents=(np.asarray(base.lin.values), np.asarray(last.lin.values) if to_stop else None),
         responses=-last.responses[:, 1:],
         coupling=coupling,
@@ -266,12 +266,12 @@ def solve_linear(known: Solution, b: Unknowns, *, transposed: bool) -> Unknowns:
     """Solve A z = b or A' z = b, A = dR/du, for right-hand sides with any batch axes in front."""
     n, n_q = known.coupling.shape
     columns = lambda a, size=n: np.asarray(a).reshape(-1, size).T  # noqa: E731  (size, n_rhs)
-    solve_0 = lambda b: _solve_columns(known.solvers.holding(known.tangents[0]), b)  # noqa: E731
+    solve_0 = lambda b: _solve_columns(known.factors, known.tangents[0], b)  # noqa: E731
     held = b.physiological is None
     if b.stop is None:
         x0 = _rows(solve_0(columns(b.physiological)), b.physiological)
         return Unknowns(physiological=x0, stop=None, q=None)
-    solve_1 = lambda b: _solve_columns(known.solvers.stop, b, known.tangents[1])  # noqa: E731
+    solve_1 = lambda b: _solve_columns(known.factors, known.tangents[1], b)  # noqa: E731
     b1, bq = columns(b.stop), columns(b.q, n_q)
     b0 = np.zeros((n, bq.shape[1])) if held else columns(b.physiological)
     by_body, by_stop, by_q = known.rows
@@ -289,13 +289,12 @@ def solve_linear(known: Solution, b: Unknowns, *, transposed: bool) -> Unknowns:
     return Unknowns(physiological=base, stop=_rows(z1, b.stop), q=_rows(zq, b.q))
 
 
-def _solve_columns(solver: LinearSolver, b: np.ndarray, values: Any = None) -> np.ndarray:
-    """K^-1 b for b (n, n_rhs), with the factors at hand or those of `values`; zero columns cost nothing."""
+def _solve_columns(factors: Factors, values: Any, b: np.ndarray) -> np.ndarray:
+    """K^-1 b for the tangent `values` and b (n, n_rhs); zero columns cost nothing."""
     x = np.zeros_like(b)
     wanted = np.any(b != 0.0, axis=0)
     if np.any(wanted):
-        columns = np.ascontiguousarray(b[:, wanted])
-        x[:, wanted] = solver.solve(columns) if values is None else solver.solve_for(values, columns)
+        x[:, wanted] = factors.solve(values, np.ascontiguousarray(b[:, wanted]))
     return x
 
 

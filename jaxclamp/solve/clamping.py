@@ -6,11 +6,14 @@ import sys
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from jaxclamp.core.failures import EquilibriumError, TermMissing
 from jaxclamp.core.progress import Progress, Tell, teller
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.files import require_computable
 from jaxclamp.scenes.scene import Scene
+from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.results import Result, work_balance
 from jaxclamp.solve.stages import Clamping
 from jaxclamp.solve.warm import on_mesh_of, solve_warm
@@ -62,7 +65,9 @@ def _from_neighbour(model: Model, guess: Result, tell: Tell, to_stop: bool, star
         return None
     carried_over = warm is not guess
     keep = not carried_over and warm.scene.solver == model.scene.solver
-    clamping = Clamping(model, tell, warm.linear_solvers if keep else None)
+    # the guess gives its solver away: it keeps the analysis of the pattern, and the last factors
+    solver = warm.factors.take(np.asarray(warm.states[-1].equilibrium.lin.values)) if keep else None
+    clamping = Clamping(model, tell, solver)
     try:
         if solve_warm(clamping, warm, to_stop, carried_over):
             return _result(clamping, None, start)
@@ -124,4 +129,6 @@ def _result(clamping: Clamping, failure: EquilibriumError | None, start: float) 
         "factor_s": system.solver.factor_seconds,
         "peak_memory_MB": peak_memory_MB(),
     }
-    return Result(clamping.model, states, failure, solver, cost, clamping.solvers)
+    settings = clamping.model.scene.solver
+    factors = Factors(clamping.model.pattern, settings.linear_solver, system.solver)
+    return Result(clamping.model, states, failure, solver, cost, factors)

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import numpy as np
@@ -231,12 +233,6 @@ class LinearSolver:
                 raise Singular("the linear system could not be solved accurately")
             self._factor_with(after)
 
-    def solve_for(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Solve with the matrix `values`, which is factored unless it was factored last."""
-        if not self.holds(values):
-            self.factor(values)
-        return self.solve(b)
-
     def holds(self, values: np.ndarray) -> bool:
         """True if this very array was factored last."""
         return self._values is values
@@ -246,3 +242,49 @@ class LinearSolver:
         upper = sp.csr_matrix((self._values, self._pattern.indices, self._pattern.indptr), shape=(n, n))
         diagonal = self._values[self._pattern.indptr[:-1]]
         return upper @ x + upper.T @ x - diagonal[:, None] * x
+
+
+MOST_SOLVERS = 2
+"""solvers that a result keeps: for the tangent in the body, and for that at the stop"""
+
+
+class Factors:
+    """The factorisations of one result. Each belongs to a tangent and is asked for by it.
+
+    A solver is in the hands of one thread at a time: it is taken out of the box, and put back with the
+    tangent that it has factored. Results never share a solver.
+    """
+
+    def __init__(self, pattern: Pattern, choice: str = "auto", *solvers: LinearSolver) -> None:
+        self._pattern, self._choice = pattern, choice
+        self._box, self._lock = list(solvers), threading.Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """In another process, an empty box."""
+        return Factors, (self._pattern, self._choice)
+
+    def take(self, values: np.ndarray | None = None) -> LinearSolver:
+        """A solver for good, out of the box or new: the one that has factored `values`, if there is one."""
+        with self._lock:
+            known = [solver for solver in self._box if values is not None and solver.holds(values)]
+            # else the one that was put back first, once there are enough
+            spare = self._box[:1] if values is None or len(self._box) >= MOST_SOLVERS else []
+            for solver in (*known, *spare):
+                self._box.remove(solver)
+                return solver
+        return LinearSolver(self._pattern, self._choice)
+
+    @contextmanager
+    def lease(self, values: np.ndarray) -> Iterator[LinearSolver]:
+        """A solver with the factors of a tangent, for a while. Raises Singular."""
+        solver = self.take(values)
+        if not solver.holds(values):
+            solver.factor(values)
+        yield solver
+        with self._lock:
+            self._box = [*self._box, solver][-MOST_SOLVERS:]
+
+    def solve(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """K^-1 b for a tangent and right-hand sides b (n, n_rhs). Raises Singular."""
+        with self.lease(values) as solver:
+            return solver.solve(b)

@@ -8,8 +8,6 @@ import platform
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from jaxclamp.core.failures import EquilibriumError
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import FIGURES
@@ -18,7 +16,7 @@ from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
 from jaxclamp.scenes.scene import Scene
-from jaxclamp.solve.linear_solvers import LinearSolver
+from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.newton import Equilibrium
 
 if TYPE_CHECKING:
@@ -47,24 +45,6 @@ class Kept:
 
 
 @dataclasses.dataclass(frozen=True)
-class LinearSolvers:
-    """Solvers that hold the factors of a clamping: those of the last state, and room for the first's."""
-
-    stop: LinearSolver
-    """with the factors of the last state"""
-    physiological: LinearSolver
-    """unused until a derivative asks for it"""
-
-    def holding(self, values: np.ndarray) -> LinearSolver:
-        """A solver with the factors of the physiological tangent: one that has them, or after factoring."""
-        if self.stop.holds(values):
-            return self.stop
-        if not self.physiological.holds(values):
-            self.physiological.factor(values)
-        return self.physiological
-
-
-@dataclasses.dataclass(frozen=True)
 class Result:
     """Every converged state of a clamping."""
 
@@ -78,8 +58,8 @@ class Result:
     """counts and checks, as in result.json"""
     cost: dict[str, Any]
     """times and memory, as in result.json"""
-    linear_solvers: LinearSolvers = dataclasses.field(repr=False)
-    """with factors for derivatives"""
+    factors: Factors = dataclasses.field(repr=False)
+    """of its tangents, for derivatives"""
     errors: dict[str, dict[str, float | None]] | None = None
     """how far the main figures may be off, see `jaxclamp.trust.estimates`; None if it was not asked for"""
 

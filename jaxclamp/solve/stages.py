@@ -30,7 +30,7 @@ from jaxclamp.solve.follow import follow, stretched
 from jaxclamp.solve.inflation import inflated_positions, inflated_radius
 from jaxclamp.solve.linear_solvers import LinearSolver
 from jaxclamp.solve.newton import Equilibrium, Path, Step, System, bordered_step, newton
-from jaxclamp.solve.results import Kept, LinearSolvers
+from jaxclamp.solve.results import Kept
 from jaxclamp.solve.stops import Condition, Held, Row, Until
 
 FIRST_TOUCH = 0.02
@@ -62,21 +62,18 @@ class Clamping:
     """One clamping under way: the system, what has converged so far, and whom to tell."""
 
     def __init__(
-        self, model: Model, tell: Tell, solvers: LinearSolvers | None = None, every_term: bool = False
+        self, model: Model, tell: Tell, solver: LinearSolver | None = None, every_term: bool = False
     ) -> None:
         self.model, self.tell, self.start = model, tell, time.perf_counter()
         self.every_term = every_term
         """do not leave out what the stop seems not to need"""
         self.states: list[Kept] = []
         settings = model.scene.solver
-        if solvers is None:
-            fresh = lambda: LinearSolver(model.pattern, settings.linear_solver)  # noqa: E731
-            solvers = LinearSolvers(stop=fresh(), physiological=fresh())
-        self.solvers = solvers
-        solvers.stop.reset_counts()
+        solver = solver or LinearSolver(model.pattern, settings.linear_solver)
+        solver.reset_counts()
         self.system = System(
             potential=model.potential,
-            solver=solvers.stop,
+            solver=solver,
             tolerance=settings.tolerance,
             length=1.0,
             diagonal=model.pattern.diagonal,

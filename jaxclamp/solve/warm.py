@@ -15,7 +15,7 @@ from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model, build_model, same_kind
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.follow import stretched
-from jaxclamp.solve.newton import Equilibrium, newton, predict
+from jaxclamp.solve.newton import Equilibrium, Step, newton, predict
 from jaxclamp.solve.results import Kept, Result
 from jaxclamp.solve.stages import Clamping
 from jaxclamp.solve.stops import Held
@@ -145,18 +145,21 @@ def predicted(result: Result, scene: Scene) -> Result:
     """
     assert result.physiological is not None
     base, last = result.physiological.equilibrium, result.states[-1]
-    clamping = Clamping(build_model(scene, result.model), lambda event: None, result.linear_solvers)
+    model = build_model(scene, result.model)
+    clamping = Clamping(model, lambda event: None)
     clamping.use_terms(closing=False)
     clamping.refer_to(base.state)
-    values = np.asarray(base.lin.values)
-    in_body = dataclasses.replace(clamping.system, solver=result.linear_solvers.holding(values))
-    near = predict(in_body, base, clamping.step(Held(float(base.state.jaw_height))))
+    near = _predicted(clamping, result, base, clamping.step(Held(float(base.state.jaw_height))))
     clamping.keep("physiological", dataclasses.replace(base, state=near), 1.0, "")
     if last.stage == "clamping":
         clamping.use_terms(closing=True)
-        if not clamping.system.solver.holds(np.asarray(last.equilibrium.lin.values)):
-            clamping.system.solver.factor(np.asarray(last.equilibrium.lin.values))
         step = clamping.at_stop(last.equilibrium.state)
-        near = predict(clamping.system, last.equilibrium, step)
+        near = _predicted(clamping, result, last.equilibrium, step)
         clamping.keep("clamping", dataclasses.replace(last.equilibrium, state=near), 1.0, "")
-    return dataclasses.replace(result, model=clamping.model, states=tuple(clamping.states))
+    return dataclasses.replace(result, model=model, states=tuple(clamping.states))
+
+
+def _predicted(clamping: Clamping, result: Result, near: Equilibrium, step: Step) -> State:
+    """The state of a step to first order, with the factors that the result has of a near one."""
+    with result.factors.lease(np.asarray(near.lin.values)) as solver:
+        return predict(dataclasses.replace(clamping.system, solver=solver), near, step)

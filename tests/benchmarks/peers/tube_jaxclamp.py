@@ -23,14 +23,15 @@ import tube_work as work
 
 import jaxclamp as jc
 from jaxclamp.physics.materials import HGO
+from jaxclamp.potential.energy import lumen_volume, with_equilibrium_pressure
 from jaxclamp.potential.model import build_model
-from jaxclamp.potential.tangent import lumen_volume, with_equilibrium_pressure
 from jaxclamp.scenes.scene import Layer, Scene
 from jaxclamp.solve.clamping import inflate
 from jaxclamp.solve.linear_solvers import LinearSolver
-from jaxclamp.solve.newton import Held, Step, System
+from jaxclamp.solve.newton import Step, System
 from jaxclamp.solve.newton import newton as own_newton
 from jaxclamp.solve.results import Result
+from jaxclamp.solve.stops import Held
 
 
 def tube_scene(counts: Sequence[int], tolerance: float) -> Scene:
@@ -67,15 +68,15 @@ def newton_alone(scene: Scene, u: np.ndarray, pressures: Sequence[float]) -> wor
     """Its Newton's method from the start displacement that the other codes have."""
     model = build_model(scene)
     system = System(
-        body=model.body,
+        potential=model.solved(work.PRESSURE, closing=False),
         solver=LinearSolver(model.pattern, scene.solver.linear_solver),
         tolerance=scene.solver.tolerance,
         length=work.INNER_RADIUS,
-        diagonal=model.pattern.indptr[:-1],
+        diagonal=model.pattern.diagonal,
     )
     mesh = work.tube_mesh(scene.mesh.circumferential, scene.mesh.axial, *scene.mesh.radial)
     far = 1e3
-    state = with_equilibrium_pressure(model.body, jnp.asarray(mesh.points + u), jnp.asarray(far))
+    state = with_equilibrium_pressure(model.potential, jnp.asarray(mesh.points + u), jnp.asarray([far]))
     start = time.perf_counter()
     for p in pressures:
         state = own_newton(system, state, Step(Held(far), p, work.STRETCH)).state
@@ -86,8 +87,8 @@ def newton_alone(scene: Scene, u: np.ndarray, pressures: Sequence[float]) -> wor
 
 def residual_share(result: Result) -> float:
     """|r_free| / |f_pressure| of an inflated artery."""
-    body, kept = result.model.body, result.physiological.equilibrium
-    load = work.PRESSURE * jax.grad(lumen_volume, argnums=1)(body, kept.state.x)
+    potential, kept = result.model.potential, result.physiological.equilibrium
+    load = work.PRESSURE * jax.grad(lumen_volume, argnums=1)(potential, kept.state.x)
     return float(np.linalg.norm(kept.lin.residual) / jnp.linalg.norm(load))
 
 
