@@ -10,6 +10,7 @@ jax.config.update("jax_enable_x64", True)
 from jaxclamp.core.failures import EquilibriumError, SceneError  # noqa: E402
 from jaxclamp.core.progress import Progress  # noqa: E402
 from jaxclamp.observe.measures import (  # noqa: E402
+    MEASURES,
     Measure,
     axial_stress_at_P,
     circumferential_stress_at_P,
@@ -42,6 +43,7 @@ from jaxclamp.solve.results import versions  # noqa: E402
 from jaxclamp.trust.estimates import with_errors  # noqa: E402
 
 __all__ = [
+    "MEASURES",
     "EquilibriumError",
     "ForceStop",
     "Measure",

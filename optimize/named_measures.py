@@ -14,26 +14,6 @@ from jaxclamp.scenes.wording import did_you_mean
 FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
 """internal unit -> unit in files, and internal units in one of it; the others are the same"""
 
-FACTORIES: tuple[Callable[..., Measure], ...] = (
-    jc.smooth_peak_axial_stress,
-    jc.smooth_peak_circumferential_stress,
-    jc.smooth_peak_principal_stress,
-    jc.axial_stress_at_P,
-    jc.circumferential_stress_at_P,
-    jc.clamp_force,
-    jc.jaw_travel,
-    jc.lumen_height,
-    jc.lumen_width,
-    jc.lumen_area,
-    jc.mean_contact_pressure,
-    jc.smooth_peak_contact_pressure,
-    jc.volume_above,
-    jc.stored_energy,
-    jc.jaw_curvature,
-    jc.jaw_half_width,
-)
-"""the measures of `jaxclamp` that a file can name"""
-
 _EXAMPLE: dict[str, Any] = {"layer": "media", "stress": 1.0}
 _KINDS: dict[str, Any] = {"layer": (str, "the name of a layer"), "stress": ((int, float), "a stress in kPa")}
 
@@ -56,10 +36,12 @@ class Named:
 
 
 def named() -> dict[str, Named]:
-    """All measures by their key, such as "clamp_force_N"."""
+    """The measures of `jaxclamp` that a file can name, by their key, such as "clamp_force_N"."""
     found = {}
-    for factory in FACTORIES:
+    for factory in jc.MEASURES:
         example = factory(**{name: _EXAMPLE[name] for name in inspect.signature(factory).parameters})
+        if not example.needs_stop:  # no design of a clamp changes it
+            continue
         unit, factor = FILE_UNIT.get(example.unit, (example.unit, 1.0))
         key = f"{example.name}_{unit}" if unit else example.name
         found[key] = Named(key, factory, factor)

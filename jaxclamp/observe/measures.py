@@ -144,6 +144,28 @@ def jaw_half_width() -> Measure:
     return Measure("jaw_half_width", "mm", _jaw_half_width)
 
 
+MEASURES: tuple[Callable[..., Measure], ...] = (
+    smooth_peak_axial_stress,
+    smooth_peak_circumferential_stress,
+    smooth_peak_principal_stress,
+    axial_stress_at_P,
+    circumferential_stress_at_P,
+    clamp_force,
+    jaw_travel,
+    lumen_height,
+    lumen_width,
+    lumen_area,
+    mean_contact_pressure,
+    smooth_peak_contact_pressure,
+    volume_above,
+    stored_energy,
+    physiological_lumen_radius,
+    jaw_curvature,
+    jaw_half_width,
+)
+"""every factory: study files can name those at the stop by the measure's name and unit"""
+
+
 # --- the functions ------------------------------------------------------------------------------
 
 
