@@ -29,13 +29,13 @@ class Symmetry:
         return 2 ** len(self.planes)
 
     @property
-    def parts_of_a_jaw(self) -> int:
+    def parts_of_a_jaw(self) -> float:
         """Factor from the force that belongs to the jaws' height in the model to that on one whole jaw.
 
         With the plane y = 0 the model holds one jaw only. Without it, two jaws alike share one height, and
         each takes half of the force.
         """
-        return self.parts // 2
+        return self.parts / 2
 
     @property
     def parts_of_a_section(self) -> int:
