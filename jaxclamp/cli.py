@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jaxclamp.core.failures import SceneError
+from jaxclamp.core.failures import Failure
 from jaxclamp.scenes.presets import KINDS, preset
 from jaxclamp.scenes.presets import presets as shipped
 from jaxclamp.show import console
@@ -25,7 +25,8 @@ from jaxclamp.show import console
 if TYPE_CHECKING:
     from jaxclamp.scenes.scene import Scene
 
-DONE, WRONG_INPUT, NOT_CONVERGED, MACHINE_REFUSED, INTERRUPTED = 0, 2, 3, 4, 130
+DONE, WRONG_INPUT, MACHINE_REFUSED, INTERRUPTED = 0, 2, 4, 130
+"""exit codes; failures bring their own"""
 
 app = typer.Typer(
     help="Clamping of arteries by finite elements: stress-free, load-free, physiological, clamped.",
@@ -94,12 +95,10 @@ def _fail(sentence: str, code: int) -> int:
 
 def _refusal(error: Exception) -> tuple[str, int] | None:
     """Sentence and exit code of an error that is not a mistake of this program."""
-    if isinstance(error, SceneError):
-        return str(error), WRONG_INPUT
+    if isinstance(error, Failure):
+        return str(error), error.exit_code
     if (usage := getattr(error, "format_message", None)) is not None:  # of the command itself
         return usage(), WRONG_INPUT
-    if type(error).__name__ in ("EquilibriumError", "NoReference"):
-        return str(error), NOT_CONVERGED
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return (
             "not enough memory: take a coarser mesh (--fidelity draft, or fewer mesh elements)",
@@ -142,7 +141,7 @@ def show(
 ) -> None:
     """Check a scene and say what would be modelled; solves nothing."""
     loaded = _load(scene, fidelity, overrides, quiet)
-    from jaxclamp.potential.model import describe
+    from jaxclamp.show.description import describe
 
     described = describe(loaded)
     if as_json:
@@ -174,7 +173,7 @@ def run(
         typer.echo("\n".join(console.summary(result.to_dict(), files)))
     if failure is not None:
         kept = f" (the states that converged are in {folder})" if files else ""
-        return _fail(f"{failure}{kept}", NOT_CONVERGED)
+        return _fail(f"{failure}{kept}", failure.exit_code)
     return DONE
 
 
@@ -294,7 +293,7 @@ def _check_folder(folder: Path) -> None:
         ) from None
 
 
-def _solve(scene: Scene, quiet: bool) -> tuple[Any, Exception | None]:
+def _solve(scene: Scene, quiet: bool) -> tuple[Any, Failure | None]:
     """The result (None if there is nothing to keep), and why it does not reach the stop."""
     from jaxclamp.core.failures import EquilibriumError
     from jaxclamp.solve.clamping import clamp

@@ -88,8 +88,7 @@ def plot_stress(study: Study) -> Picture:
     for column, (name, result) in enumerate(results.items()):
         for row, layer in enumerate(layers[name]):
             axes: Axes = grid[row, column]
-            first, end = result.model.mesh.layer_cells[row]
-            P = first <= result.model.marks.P_cell < end
+            P = row == result.model.marks.P_layer
             unrolled(axes, layer, load_free_angles(result, row), reach, scale, P)
             dress(
                 axes,

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from jaxclamp.cli import main
-from jaxclamp.core.failures import EquilibriumError, NotConverged
+from jaxclamp.core.failures import EquilibriumError, NoReference, NotConverged, SceneError
 from jaxclamp.scenes.fidelity import mesh_for
 from jaxclamp.scenes.presets import presets
 
@@ -69,7 +69,8 @@ class Engine:
 
     def describe(self, scene):
         return {
-            "symmetry": "one eighth",
+            "symmetry": "1/8",
+            "modelled": "one eighth",
             "layers": ["media", "adventitia"],
             "terms": [("wall", "always")],
             "unknowns": 4266,
@@ -91,14 +92,14 @@ class Engine:
 def engine(monkeypatch, tmp_path):
     """The command line with a stand-in for the solver, in an empty folder."""
     fake = Engine()
-    clamping, export = types.ModuleType("jaxclamp.clamping"), types.ModuleType("jaxclamp.export")
+    clamping, export = types.ModuleType("clamping"), types.ModuleType("export")
     clamping.clamp, export.write_outputs = fake.clamp, fake.write_outputs
-    errors = types.ModuleType("jaxclamp.errors")
+    errors = types.ModuleType("estimates")
     errors.with_errors = lambda result: result
-    monkeypatch.setitem(sys.modules, "jaxclamp.errors", errors)
-    monkeypatch.setattr("jaxclamp.model.describe", fake.describe)
-    monkeypatch.setitem(sys.modules, "jaxclamp.clamping", clamping)
-    monkeypatch.setitem(sys.modules, "jaxclamp.export", export)
+    monkeypatch.setitem(sys.modules, "jaxclamp.trust.estimates", errors)
+    monkeypatch.setattr("jaxclamp.show.description.describe", fake.describe)
+    monkeypatch.setitem(sys.modules, "jaxclamp.solve.clamping", clamping)
+    monkeypatch.setitem(sys.modules, "jaxclamp.show.export", export)
     monkeypatch.chdir(tmp_path)
     return fake
 
@@ -243,6 +244,12 @@ def test_no_solution_at_all_writes_nothing(engine, capsys, tmp_path):
     assert everything_below(tmp_path) == []
 
 
+@pytest.mark.parametrize(("failure", "code"), [(NoReference("no finer mesh"), 3), (SceneError("bad"), 2)])
+def test_every_failure_brings_its_exit_code(engine, capsys, failure, code):
+    engine.outcome = failure
+    assert call(capsys, "run", "human-lad", "--quiet") == (code, "", f"jaxclamp: {failure}\n")
+
+
 # ------------------------------------------------------------------------------------- the machine
 
 
@@ -336,7 +343,8 @@ def test_show_describes_and_solves_nothing(engine, capsys, tmp_path):
     assert (code, err) == (0, "")
     assert out.splitlines()[0] == "Human LAD between two cylinders"
     assert all(
-        word in out for word in ("symmetry: one eighth", "adventitia", "wall: always", "unknowns: 4266")
+        word in out
+        for word in ("symmetry: 1/8", "modelled: one eighth", "adventitia", "wall: always", "unknowns: 4266")
     )
     assert "predicted: 3 s" in out
     assert "warnings" not in out

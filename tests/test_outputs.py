@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import errno
+import functools
 import json
 import re
 import types
@@ -14,14 +15,16 @@ import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 import jaxclamp as jc
 from jaxclamp.core.failures import EquilibriumError, NotConverged
 from jaxclamp.fem.tube import closed_positions
+from jaxclamp.observe.figures import shown_in
 from jaxclamp.observe.stresses import stresses
+from jaxclamp.potential.energy import with_equilibrium_pressure
 from jaxclamp.potential.model import build_model
-from jaxclamp.potential.tangent import with_equilibrium_pressure
-from jaxclamp.show import export, fields, paraview
+from jaxclamp.show import export, fields, paraview, plots
 from jaxclamp.show.report import page, write_report
 
 meshio = pytest.importorskip("meshio")
@@ -143,8 +146,9 @@ def test_artery_is_whole_sound_and_of_the_right_volume(result, folder, number):
     assert len(block.data) == 8 * result.model.mesh.n_cells
     cell_volumes, least = volumes(mesh.points, block.data)
     assert least > 0.0
-    J = np.asarray(stresses(result.model.body, kept.state).J)
-    modelled = float(np.sum(J * np.asarray(result.model.body.geometry.dV)))
+    potential = result.model.potential
+    known = zip(potential.layers, stresses(potential, kept.state), strict=True)
+    modelled = sum(float(jnp.sum(s.J * group.terms[0].here.dV)) for group, s in known)
     assert cell_volumes.sum() == pytest.approx(8.0 * modelled, rel=1e-12)
     stretch = kept.equilibrium.axial_stretch
     length = float(result.scene.artery.length) * stretch
@@ -230,9 +234,9 @@ def test_quadratic_elements_are_written_and_mirrored_too(tmp_path):
         ["mesh.circumferential=2", "mesh.axial=2", "mesh.radial=[1, 1]", "mesh.element=q2p1"],
     )
     model = build_model(scene)
-    far = jnp.asarray(100.0)
+    far = jnp.asarray([100.0])
     x = closed_positions(model.mesh, scene.mesh, scene.artery)
-    kept = types.SimpleNamespace(state=with_equilibrium_pressure(model.body, x, far))
+    kept = types.SimpleNamespace(state=with_equilibrium_pressure(model.potential, x, far))
     fake = types.SimpleNamespace(model=model, scene=scene, load_free=kept)
     meshio.write(tmp_path / "a.vtu", paraview.artery_mesh(fake, kept))
     (block,) = meshio.read(tmp_path / "a.vtu").cells
@@ -259,6 +263,148 @@ def test_an_artery_too_fine_to_show_whole_is_written_as_the_modelled_part(result
     assert len(artery.cells[0].data) == result.model.mesh.n_cells
     assert volumes(artery.points, artery.cells[0].data)[1] > 0.0
     assert jaws.points[:, 1].min() > 0.0
+
+
+# --------------------------------------------------------------------------------- any symmetry
+
+SYMMETRIES = ("xyz", "xy", "xz", "yz", "x", "y", "z", "none")
+
+
+@functools.cache
+def pressed(symmetry: str, element: str = "q1p0"):
+    """A result of one made-up flattened state, the same artery however much of it is modelled."""
+    counts = ["mesh.circumferential=4", "mesh.axial=3", "mesh.radial=[2, 1]"]
+    scene = jc.load_scene("human-lad", [*counts, f"mesh.symmetry={symmetry}", f"mesh.element={element}"])
+    model = build_model(scene)
+    x, y, z = closed_positions(model.mesh, scene.mesh, scene.artery).T
+    near = jnp.exp(-((z / 3.0) ** 2))
+    flat = jnp.stack([x * (1.0 + 0.2 * near), y * (1.0 - 0.5 * near), z * (1.0 + 1e-3 * x**2)], axis=1)
+    load_free, last = (
+        types.SimpleNamespace(
+            state=with_equilibrium_pressure(model.potential, positions, jnp.asarray([1.1])),
+            values={"outer_radius_mm": 2.4},
+        )
+        for positions in (jnp.stack([x, y, z], axis=1), flat)
+    )
+    return types.SimpleNamespace(
+        model=model,
+        scene=scene,
+        load_free=load_free,
+        physiological=load_free,
+        states=(load_free, last),
+        closing=(load_free, last),
+        history=[{"jaw_travel_mm": travel, "occlusion": 0.5 * travel} for travel in (0.0, 1.0)],
+        converged=True,
+    )
+
+
+def layers_of(result) -> tuple[fields.LayerFields, ...]:
+    return fields.layer_fields(result.model, result.closing[-1].state, result.load_free.state)
+
+
+@pytest.mark.parametrize("symmetry", SYMMETRIES)
+def test_the_whole_artery_is_the_same_however_much_is_modelled(symmetry):
+    eighth, result = pressed("xyz"), pressed(symmetry)
+    assert 8 * eighth.model.mesh.n_cells == result.model.symmetry.parts * result.model.mesh.n_cells
+    for few, many in zip(layers_of(eighth), layers_of(result), strict=True):
+        expected, found = fields.whole(few), fields.whole(many)
+        assert found.points.shape == expected.points.shape
+        distance, place = KDTree(found.points).query(expected.points)
+        assert distance.max() < 1e-9
+        assert len(np.unique(place)) == len(place)
+        assert set(found.point_data) == {*fields.STRESSES, "pressure_kPa", "contact_pressure_kPa"} | {
+            "displacement_mm"
+        }
+        for name, values in expected.point_data.items():
+            np.testing.assert_allclose(found.point_data[name][place], values, atol=1e-9, err_msg=name)
+        corners = list(found.element.meshio_nodes)
+        sizes, least = volumes(found.points, found.cells[corners].T)
+        assert least > 0.0
+        assert sizes.sum() == pytest.approx(volumes(expected.points, expected.cells[corners].T)[0].sum())
+        assert np.sort(found.cell_data["J"]) == pytest.approx(np.sort(expected.cell_data["J"]))
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "element"), [*((symmetry, "q1p0") for symmetry in SYMMETRIES), ("x", "q2p1")]
+)
+def test_the_whole_grid_goes_from_end_to_end_and_round_from_the_fold(symmetry, element):
+    result = pressed(symmetry, element)
+    order = result.model.mesh.element.order
+    for layer, cells in zip(layers_of(result), (2, 1), strict=True):
+        grid = fields.whole_grid(layer)
+        assert grid.points.shape == (2 * 3 * order + 1, 4 * 4 * order + 1, cells * order + 1, 3)
+        assert np.array_equal(grid.points[:, 0], grid.points[:, -1])
+        assert np.all(np.diff(grid.points[..., 2], axis=0) > 0.0)
+        angle = np.degrees(np.unwrap(np.arctan2(grid.points[..., 1], grid.points[..., 0]), axis=1))
+        assert np.all(np.diff(angle, axis=1) > 0.0)
+        assert angle[:, [0, grid.line(1), grid.line(2), grid.line(3), -1]] == pytest.approx(
+            np.broadcast_to(
+                np.array([0, 90, 180, 270, 360])[:, None], (*angle[:, :5].shape[:2], cells * order + 1)
+            ),
+            abs=1e-9,
+        )
+        assert grid.points[grid.middle, ..., 2] == pytest.approx(0.0, abs=1e-12)
+        # as many points as the cells have, each once: the grid repeats only the line on which it closes
+        every = np.concatenate([grid.points[:, :-1].reshape(-1, 3), fields.whole(layer).points])
+        assert len(np.unique(np.round(every, 9) + 0.0, axis=0)) == len(every) // 2
+        for axis in range(3):  # moved outwards where it lies outside, on all sides
+            moved = grid.point_data["displacement_mm"][..., axis]
+            turned = moved * np.sign(np.round(grid.points[..., axis], 9)) * (-1.0 if axis == 1 else 1.0)
+            assert turned.min() > -1e-9
+            assert turned.max() > 0.01
+
+
+@pytest.mark.parametrize("name", ["axial_stress_maps", "sections", "wall_stress"])
+@pytest.mark.parametrize("symmetry", ["none", "xz", "z"])
+def test_pictures_do_not_tell_how_much_is_modelled(symmetry, name):
+    draw = getattr(plots, f"plot_{name}")
+    expected, found = (_pixels(draw(each)) for each in (pressed("xyz"), pressed(symmetry)))
+    assert expected.shape == found.shape
+    assert expected.std() > 20.0
+    assert np.mean(np.abs(expected - found).max(axis=-1) > 16.0) < 1e-3
+
+
+@pytest.mark.parametrize("symmetry", ["xyz", "x", "none"])
+def test_pictures_have_both_walls_and_every_peak(symmetry):
+    result = pressed(symmetry)
+    along = plots.plot_sections(result).axes[1]
+    outlines = np.concatenate([patch.get_xy() for patch in along.patches])
+    for mirror in ([1, -1], [-1, 1]):
+        assert KDTree(outlines).query(outlines * mirror)[0].max() < 0.01
+    for axes, layer in zip(plots.plot_axial_stress_maps(result).axes[::2], layers_of(result), strict=False):
+        (crosses,) = [line.get_xydata() for line in axes.lines if line.get_marker() == "x"]
+        assert KDTree(crosses).query(crosses * [-1, 1])[0].max() < 1e-9
+        assert KDTree(crosses).query([0, 180] + crosses * [1, -1])[0].max() < 1e-9
+        zoom = axes.get_xlim()[1]
+        shown = np.abs(layer.points[:, 2]) <= zoom
+        highest = np.argmax(np.where(shown, layer.point_data["axial_stress_kPa"], -np.inf))
+        assert np.abs(np.abs(crosses[:, 0]) - np.abs(layer.points[highest, 2])).max() < 1e-9
+
+
+def _pixels(figure) -> np.ndarray:
+    """Red, green, blue and opacity from 0 to 255, (height, width, 4)."""
+    figure.set_dpi(60)
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba(), float)
+
+
+@pytest.mark.parametrize(("symmetry", "jaws"), [("xyz", [0]), ("z", [0, 1])])
+def test_files_of_the_modelled_part_show_the_jaws_that_are_modelled(symmetry, jaws):
+    result = pressed(symmetry)
+    outline = fields.jaw_outline(result.scene.clamp.jaw, 3.0)
+    drawn = paraview.jaw_mesh(result, result.closing[-1], outline, full=False)
+    assert np.unique(drawn.cell_data["jaw"][0]).tolist() == jaws
+    assert np.ptp(np.sign(drawn.points[:, 1])) == 2.0 * (len(jaws) - 1)
+
+
+def test_a_report_of_a_half_says_so(result):
+    half = jc.clamp(jc.replace(result.scene, "mesh.symmetry", "z"))
+    text = page(half, [])
+    assert "one half: the whole circumference by half the length" in text
+    assert "eighth" not in text
+    assert half.to_dict()["model"]["symmetry"] == "1/2"
+    for figure in shown_in("numbers"):
+        assert half.final[figure.key] == pytest.approx(result.final[figure.key], rel=1e-6), figure.key
 
 
 # --------------------------------------------------------------------------------- figures and report
@@ -389,7 +535,9 @@ def full_disk(*args, **kwargs):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-@pytest.mark.parametrize("stage", ["meshio.write", "jaxclamp.report.page", "jaxclamp.export.history_csv"])
+@pytest.mark.parametrize(
+    "stage", ["meshio.write", "jaxclamp.show.report.page", "jaxclamp.show.export.history_csv"]
+)
 def test_a_full_disk_leaves_nothing_behind(result, tmp_path, monkeypatch, stage):
     monkeypatch.setattr(stage, full_disk)
     with pytest.raises(OSError, match="No space left"):
@@ -407,7 +555,7 @@ def test_a_full_disk_or_an_interruption_leaves_earlier_results_as_they_were(resu
         raise KeyboardInterrupt
 
     for failing in (full_disk, interrupt):
-        monkeypatch.setattr("jaxclamp.export.as_json", failing)
+        monkeypatch.setattr("jaxclamp.show.export.as_json", failing)
         with pytest.raises((OSError, KeyboardInterrupt)):
             export.write_outputs(few, tmp_path)
         assert snapshot(tmp_path) == before

@@ -10,24 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-# block of result.json and the keys of it that a summary shows
-FIGURES = {
-    "physiological": ("lumen_radius_mm", "axial_stress_at_P_kPa", "circumferential_stress_at_P_kPa"),
-    "final": (
-        "occlusion",
-        "area_occlusion",
-        "jaw_travel_mm",
-        "lumen_height_mm",
-        "lumen_width_mm",
-        "clamp_force_N",
-        "max_contact_pressure_kPa",
-        "max_penetration_mm",
-        "axial_stress_at_P_kPa",
-        "axial_stress_ratio_at_P",
-        "circumferential_stress_ratio_at_P",
-        "peak_axial_stress_kPa",
-    ),
-}
+from jaxclamp.observe.figures import shown_in
+
+IN_BODY = ("lumen_radius_mm", "axial_stress_at_P_kPa", "circumferential_stress_at_P_kPa")
+"""keys of the artery without the clamp, block "physiological" of result.json, that a summary shows"""
 UNITS = {"mm": "mm", "mm2": "mm2", "kPa": "kPa", "N": "N", "mN": "mN", "s": "s", "seconds": "s", "MB": "MB"}
 OPEN_FIRST = (".html", ".pvd", ".xdmf", ".csv", ".json")
 """files that a reader opens, the report first; pictures and the states' own files are found there"""
@@ -80,7 +66,8 @@ def summary(result: dict[str, Any], files: list[Path]) -> list[str]:
     """The key figures of a result, and the files to open, as lines."""
     done = "" if result.get("converged") else " (NOT CONVERGED: the last state that did)"
     output = [f"{result.get('title') or 'Clamping'}{done}"]
-    for block, keys in FIGURES.items():
+    blocks = {"physiological": IN_BODY, "final": tuple(figure.key for figure in shown_in("summary"))}
+    for block, keys in blocks.items():
         output += ["", f"  {block}"]
         for key in keys:
             value = (result.get(block) or {}).get(key)

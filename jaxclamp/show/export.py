@@ -19,13 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxclamp.core.progress import Progress
 from jaxclamp.show.console import as_json
 from jaxclamp.show.paraview import FOLDER as STATES
 from jaxclamp.show.paraview import write_states
 
 if TYPE_CHECKING:
-    from jaxclamp.core.progress import Progress
-    from jaxclamp.core.progress import Progress as Event
     from jaxclamp.show.plots import Plate
     from jaxclamp.solve.results import Result
 
@@ -43,7 +42,7 @@ def write_outputs(
     """
 
     folder = Path(folder)
-    tell = lambda fraction, message: progress and progress(Event("writing", fraction, message))  # noqa: E731
+    tell = lambda fraction, message: progress and progress(Progress("writing", fraction, message))  # noqa: E731
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)

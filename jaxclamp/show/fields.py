@@ -2,6 +2,9 @@
 
 Plain numpy, for pictures and files only. Layers are kept apart: a node on an interface has one
 value in each layer, because stresses jump there. Lengths mm, stresses kPa.
+
+What is not modelled is made from what is by the mirror planes of the model's `Symmetry`: as cells for
+files (`whole`), or as one regular grid for pictures (`whole_grid`).
 """
 
 from __future__ import annotations
@@ -14,11 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxclamp.fem.elements import Element
-from jaxclamp.fem.tube import Mesh
-from jaxclamp.observe.stresses import contact_pressure, extrapolation, stresses, tensor_nodes
+from jaxclamp.fem.grid import Mesh
+from jaxclamp.fem.landmarks import extrapolation, tensor_nodes
+from jaxclamp.fem.symmetry import AXES, Symmetry
+from jaxclamp.observe.stresses import facet_contact, stresses
 from jaxclamp.physics.jaws import Jaw
+from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
-from jaxclamp.potential.tangent import State
+from jaxclamp.potential.terms import JAWS
 
 STRESSES = {
     "axial_stress_kPa": "axial",
@@ -26,7 +32,7 @@ STRESSES = {
     "radial_stress_kPa": "radial",
     "greatest_principal_stress_kPa": "greatest",
 }
-"""name of a nodal field -> attribute of `measures.Stresses`"""
+"""name of a nodal field -> attribute of `observe.stresses.Stresses`"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,12 +49,14 @@ class LayerFields:
     """each (n,), or (n, 3) for vectors"""
     cell_data: dict[str, np.ndarray]
     """each (n_cells,)"""
+    symmetry: Symmetry
+    """the mirror planes that make the whole artery of these points; none if they are all of it"""
     grid: tuple[int, int, int] | None
-    """points along (axial, circumferential, radial) in the order of `points`; None for the whole artery"""
+    """points along (axial, circumferential, radial) in the order of `points`; None after `whole`"""
 
     def on_grid(self, values: np.ndarray) -> np.ndarray:
         """Values at the points, by grid position (axial, circumferential, radial, ...)."""
-        assert self.grid is not None, "the whole artery is no single grid"
+        assert self.grid is not None, "mirrored points are no single grid"
         return values.reshape(*self.grid, *values.shape[1:])
 
 
@@ -59,41 +67,51 @@ def layer_nodes(mesh: Mesh, layer: int) -> np.ndarray:
 
 
 def layer_fields(model: Model, state: State, start: State | None = None) -> tuple[LayerFields, ...]:
-    """The modelled eighth, layer by layer.
+    """The modelled part, layer by layer.
 
     start: the state from which displacements count; none are given without it
     """
     mesh, element = model.mesh, model.mesh.element
-    s = jax.device_get(stresses(model.body, state))
-    dV = np.asarray(model.body.geometry.dV)
-    at_nodes = {name: extrapolation(element) @ np.asarray(getattr(s, key)) for name, key in STRESSES.items()}
     modes = element.pressure_modes(tensor_nodes(element))
-    at_nodes["pressure_kPa"] = -np.einsum("ma,mc->ac", modes, np.asarray(state.p))
-    J = np.sum(np.asarray(s.J) * dV, axis=0) / np.sum(dV, axis=0)
+    pressure = -np.einsum("ma,mc->ac", modes, np.asarray(state.p))
     x = np.asarray(state.x)
     touch = nodal_contact_pressure(model, state)
     layers = []
-    for number, (first, last) in enumerate(mesh.layer_cells):
+    for number, (group, s) in enumerate(
+        zip(model.potential.layers, stresses(model.potential, state), strict=True)
+    ):
+        first, last = mesh.layer_cells[number]
         nodes = layer_nodes(mesh, number)
         cells = np.searchsorted(nodes, mesh.cells[:, first:last])
-        data = {name: _averaged(cells, v[:, first:last], len(nodes)) for name, v in at_nodes.items()}
+        corners = {
+            name: extrapolation(element) @ np.asarray(getattr(s, key)) for name, key in STRESSES.items()
+        }
+        corners["pressure_kPa"] = pressure[:, first:last]
+        data = {name: _averaged(cells, values, len(nodes)) for name, values in corners.items()}
         data["contact_pressure_kPa"] = touch[nodes]
         if start is not None:
             data["displacement_mm"] = x[nodes] - np.asarray(start.x)[nodes]
-        radial = len(nodes) // (mesh.grid[1] * mesh.grid[2])
-        cell_data = {"layer": np.full(last - first, number + 1), "J": J[first:last]}
+        dV = np.asarray(group.terms[0].here.dV)
+        J = np.sum(np.asarray(s.J) * dV, axis=0) / np.sum(dV, axis=0)
         layers.append(
             LayerFields(
-                model.scene.artery.layers[number].name,
-                element,
-                x[nodes],
-                cells,
-                data,
-                cell_data,
-                (mesh.grid[2], mesh.grid[1], radial),
+                name=model.scene.artery.layers[number].name,
+                element=element,
+                points=x[nodes],
+                cells=cells,
+                point_data=data,
+                cell_data={"layer": np.full(last - first, number + 1), "J": J},
+                symmetry=model.symmetry,
+                grid=_layer_grid(mesh, nodes),
             )
         )
     return tuple(layers)
+
+
+def _layer_grid(mesh: Mesh, nodes: np.ndarray) -> tuple[int, int, int]:
+    """Points of a layer along (axial, circumferential, radial); nodes: those of the layer, (n,)."""
+    _, n_c, n_z = mesh.grid
+    return n_z, n_c, len(nodes) // (n_z * n_c)
 
 
 def _averaged(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
@@ -102,46 +120,67 @@ def _averaged(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     return total / np.bincount(cells.ravel(), minlength=n)
 
 
-_contact_pressure = jax.jit(contact_pressure, static_argnums=2)
+_facet_contact = jax.jit(facet_contact)
 
 
 def nodal_contact_pressure(model: Model, state: State) -> np.ndarray:
     """Contact pressure spread to the nodes of the outer wall by area, kPa, 0 elsewhere, (n_nodes,)."""
-    mesh, stencil = model.mesh, np.asarray(model.body.stencils.contact)[:, 0]
-    pressure, area = (np.asarray(v) for v in _contact_pressure(model.body, state, mesh.element))
-    share = np.abs(stencil).T
-    force = np.bincount(mesh.outer_facets.ravel(), (share @ (pressure * area)).ravel(), mesh.n_nodes)
-    around = np.bincount(mesh.outer_facets.ravel(), (share @ area).ravel(), mesh.n_nodes)
-    return np.divide(force, around, out=np.zeros_like(force), where=around > 0.0)
+    n = model.mesh.n_nodes
+    force, around = np.zeros(n), np.zeros(n)
+    for group in model.potential.of(JAWS):
+        pressure, area = (np.asarray(v) for v in _facet_contact(group, state))
+        nodes = np.asarray(group.nodes).ravel()
+        share = np.abs(np.asarray(group.terms[0].here.rule.N)).T
+        force += np.bincount(nodes, (share @ (pressure * area)).ravel(), n)
+        around += np.bincount(nodes, (share @ area).ravel(), n)
+    return np.divide(force, around, out=np.zeros(n), where=around > 0.0)
+
+
+# --------------------------------------------------------------------------------- the whole artery
 
 
 def whole(layer: LayerFields) -> LayerFields:
-    """The whole artery from the modelled eighth: reflected in the planes x = 0, y = 0 and z = 0.
+    """The whole artery from the modelled part, by its mirror planes.
 
     Points on a plane are shared by both sides, and reflected cells are renumbered so that their
     volume stays positive.
     """
-    assert layer.grid is not None, "already the whole artery"
-    n = len(layer.points)
-    on_plane = np.zeros((n, 3), dtype=bool)
-    flags = layer.on_grid(on_plane)  # a view
-    flags[:, -1, :, 0] = flags[:, 0, :, 1] = flags[0, :, :, 2] = True
-    signs = np.array([[-1 if octant >> axis & 1 else 1 for axis in range(3)] for octant in range(8)])
+    n, signs = len(layer.points), layer.symmetry.mirrors.astype(int)
     # a point's image in an octant is that in the octant on the positive side of its own planes
-    bits = np.array([1, 2, 4])
-    octant = ((signs[:, None] < 0) & ~on_plane) @ bits  # (8, n)
+    bits = 2 ** np.arange(len(AXES))
+    octant = ((signs[:, None] < 0) & ~_on_planes(layer)) @ bits  # (parts, n)
     keys, numbers = np.unique(octant * n + np.arange(n), return_inverse=True)
-    numbers = numbers.reshape(8, n)
-    source, sign = keys % n, signs[keys // n]
+    numbers = numbers.reshape(len(signs), n)
+    source = keys % n
+    sign = np.where(keys[:, None] // n & bits, -1, 1)
 
     turned = _turned(layer.element)
-    cells = np.concatenate(
-        [numbers[o][layer.cells if np.prod(signs[o]) > 0 else layer.cells[turned]] for o in range(8)],
-        axis=1,
+    cells = [
+        image[layer.cells if np.prod(s) > 0 else layer.cells[turned]]
+        for s, image in zip(signs, numbers, strict=True)
+    ]
+    return dataclasses.replace(
+        layer,
+        points=layer.points[source] * sign,
+        cells=np.concatenate(cells, axis=1),
+        point_data={name: v[source] * (sign if v.ndim == 2 else 1) for name, v in layer.point_data.items()},
+        cell_data={name: np.tile(v, len(signs)) for name, v in layer.cell_data.items()},
+        symmetry=Symmetry(""),
+        grid=None,
     )
-    data = {name: v[source] * (sign if v.ndim == 2 else 1) for name, v in layer.point_data.items()}
-    cell_data = {name: np.tile(v, 8) for name, v in layer.cell_data.items()}
-    return LayerFields(layer.name, layer.element, layer.points[source] * sign, cells, data, cell_data, None)
+
+
+def _on_planes(layer: LayerFields) -> np.ndarray:
+    """True for the points on the mirror planes with normals x, y and z, (n, 3)."""
+    assert layer.grid is not None, "already the whole artery"
+    found = np.zeros((len(layer.points), len(AXES)), dtype=bool)
+    flags = layer.on_grid(found)  # a view
+    if "z" in layer.symmetry:
+        flags[0, :, :, 2] = True
+    if not layer.symmetry.wraps:  # then the circumference begins and ends on a plane
+        for quarter, line in zip(layer.symmetry.quarters, (0, -1), strict=True):
+            flags[:, line, :, 0 if quarter % 2 else 1] = True  # x = 0 is a right angle from the fold
+    return found
 
 
 def _turned(element: Element) -> np.ndarray:
@@ -149,6 +188,63 @@ def _turned(element: Element) -> np.ndarray:
     m = element.order + 1
     i, j, k = element.node_grid.T
     return (i * m + j) * m + (m - 1 - k)
+
+
+@dataclasses.dataclass(frozen=True)
+class WholeGrid:
+    """One layer of the whole artery as a regular grid: axial, circumferential, radial.
+
+    Axial from end to end, radial from inside to outside; circumferential from the fold over the
+    compression axis (90 deg) all the way round, so that the last line is the first one again.
+    """
+
+    points: np.ndarray
+    """current position, mm, (n_z, n_c, n_r, 3)"""
+    point_data: dict[str, np.ndarray]
+    """each (n_z, n_c, n_r), or (n_z, n_c, n_r, 3) for vectors"""
+
+    @property
+    def middle(self) -> int:
+        """Axial grid line at mid-length."""
+        return self.points.shape[0] // 2
+
+    def line(self, quarter: int) -> int:
+        """Circumferential grid line at so many right angles from the fold, 0 to 4."""
+        return quarter * (self.points.shape[1] - 1) // 4
+
+    @property
+    def upper(self) -> slice:
+        """Circumferential grid lines of the upper half, from fold to fold."""
+        return slice(self.line(2) + 1)
+
+
+def whole_grid(layer: LayerFields) -> WholeGrid:
+    """The whole artery from the modelled part, by its mirror planes, points and their data as one grid."""
+    unfold = lambda values: _unfolded(layer.symmetry, layer.on_grid(values))  # noqa: E731
+    return WholeGrid(unfold(layer.points), {name: unfold(v) for name, v in layer.point_data.items()})
+
+
+def whole_positions(model: Model, state: State, layer: int) -> WholeGrid:
+    """The positions of one layer alone, without data: cheap, for a state of which no stress is shown."""
+    nodes = layer_nodes(model.mesh, layer)
+    x = np.asarray(state.x)[nodes].reshape(*_layer_grid(model.mesh, nodes), 3)
+    return WholeGrid(_unfolded(model.symmetry, x), {})
+
+
+def _unfolded(symmetry: Symmetry, values: np.ndarray) -> np.ndarray:
+    """Values (n_z, n_c, n_r) or vectors (..., 3) on the grid of the modelled part, on the whole artery's."""
+    for axis in "xy":  # from a quarter to the upper half, from a half to the whole
+        if axis in symmetry:
+            values = np.concatenate([values, _mirrored(values, axis)[:, -2::-1]], axis=1)
+    ring = values if symmetry.wraps else values[:, :-1]
+    from_fold = np.roll(ring, symmetry.quarters[0] * (ring.shape[1] // 4), axis=1)
+    closed = np.concatenate([from_fold, from_fold[:, :1]], axis=1)
+    return np.concatenate([_mirrored(closed, "z")[:0:-1], closed]) if "z" in symmetry else closed
+
+
+def _mirrored(values: np.ndarray, axis: str) -> np.ndarray:
+    """Values (n_z, n_c, n_r) or vectors (n_z, n_c, n_r, 3) as a mirror plane with that normal shows them."""
+    return values * np.where(np.array(list(AXES)) == axis, -1, 1) if values.ndim == 4 else values
 
 
 def spread(positions: Sequence[float], count: int) -> list[int]:

@@ -13,7 +13,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from jaxclamp.fem.tube import Mesh
+from jaxclamp.potential.model import Model
 from jaxclamp.show.fields import jaw_height_shown, jaw_outline, layer_fields, whole
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 INDEX = "clamping.pvd"
 FOLDER = "paraview"
 LARGEST_WHOLE = 200_000
-"""cells; a finer artery is written as the modelled eighth"""
+"""cells; a finer artery is written as the modelled part"""
 SIDE_MARGIN = 1.15
 """half the width of the drawn jaws over that of the widest artery"""
 
@@ -34,8 +34,7 @@ def write_states(
     import meshio
 
     (folder / FOLDER).mkdir(exist_ok=True)
-    mesh = result.model.mesh
-    full = is_whole(mesh)
+    full = is_whole(result.model)
     outline = jaw_outline(result.scene.clamp.jaw, 2.0 * _widest(result))
     index: list[tuple[int, str, str]] = []
     for number, kept in enumerate(result.states):
@@ -51,9 +50,9 @@ def write_states(
     return [*(folder / name for _, _, name in index), folder / INDEX]
 
 
-def is_whole(mesh: Mesh) -> bool:
-    """True if files show the whole artery, False if only the modelled eighth."""
-    return 8 * mesh.n_cells <= LARGEST_WHOLE
+def is_whole(model: Model) -> bool:
+    """True if files show the whole artery, False if only the modelled part of it."""
+    return model.symmetry.parts * model.mesh.n_cells <= LARGEST_WHOLE
 
 
 def pvd(index: list[tuple[int, str, str]]) -> str:
@@ -102,7 +101,8 @@ def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True) -> Any:
-    """Both jaws of a state (only the upper one with the modelled eighth) as a meshio mesh of quadrilaterals.
+    """The jaws of a state as a meshio mesh of quadrilaterals: both, or only the upper one where just that is
+    modelled and shown.
 
     outline: closed curve (z, y) of the jaw, mm, from `jaw_outline`
     """
@@ -121,7 +121,7 @@ def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True)
     following = (around + 1) % n
     quads = np.stack([around, following, n + following, n + around], axis=1)
     points, cells, jaw = upper, quads, np.zeros(n, dtype=int)
-    if full:
+    if full or "y" not in result.model.symmetry:
         points = np.concatenate([upper, upper * [1.0, -1.0, 1.0]])
         cells = np.concatenate([quads, quads[:, ::-1] + len(upper)])
         jaw = np.repeat([0, 1], n)
@@ -131,4 +131,4 @@ def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True)
 def _widest(result: Result) -> float:
     """Half the width of the artery where and when it is widest, mm."""
     nodes = result.model.mesh.plane(0, -1)
-    return max(float(np.max(np.asarray(kept.state.x)[nodes, 0])) for kept in result.states)
+    return max(float(np.max(np.abs(np.asarray(kept.state.x)[nodes, 0]))) for kept in result.states)

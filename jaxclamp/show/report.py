@@ -9,6 +9,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxclamp.fem.symmetry import AXES, Symmetry
+from jaxclamp.observe.figures import shown_in
 from jaxclamp.show.console import name_and_unit
 from jaxclamp.show.fields import layer_fields
 from jaxclamp.trust.estimates import SOURCES
@@ -18,33 +20,6 @@ if TYPE_CHECKING:
     from jaxclamp.solve.results import Result
 
 UNITS = {"mm": "mm", "mm2": "mm²", "kPa": "kPa", "N": "N", "mN": "mN", "uJ": "µJ", "s": "s", "MB": "MB"}
-
-HEADLINES = (
-    ("occlusion", "occlusion"),
-    ("clamp_force_N", "force on one jaw"),
-    ("axial_stress_ratio_at_P", "axial stress at P, over that in the body"),
-    ("max_contact_pressure_kPa", "highest contact pressure"),
-)
-NUMBERS = (
-    ("jaw_travel_mm", "travel of each jaw"),
-    ("lumen_height_mm", "lumen height"),
-    ("lumen_width_mm", "lumen width"),
-    ("lumen_area_mm2", "lumen area"),
-    ("occlusion", "occlusion by height"),
-    ("area_occlusion", "occlusion by area"),
-    ("clamp_force_N", "force on one jaw"),
-    ("mean_contact_pressure_kPa", "mean contact pressure"),
-    ("max_contact_pressure_kPa", "highest contact pressure"),
-    ("contact_area_mm2", "contact area of one jaw"),
-    ("axial_stress_at_P_kPa", "axial stress at P"),
-    ("circumferential_stress_at_P_kPa", "circumferential stress at P"),
-)
-PEAKS = (
-    ("peak_axial_stress_kPa", "axial"),
-    ("smooth_peak_axial_stress_kPa", "axial, smooth peak"),
-    ("peak_circumferential_stress_kPa", "circumferential"),
-    ("peak_principal_stress_kPa", "greatest principal"),
-)
 
 PIXELS_PER_INCH = 100
 """of figures on the page"""
@@ -106,7 +81,7 @@ def page(result: Result, plates: Iterable[tuple[Plate, bytes]]) -> str:
     sections = [
         _opening(title, content, result),
         figure_section(plates),
-        section("Numbers", _numbers(content, [layer.name for layer in result.scene.artery.layers])),
+        section("Numbers", _numbers(content, result)),
         section("Numerical errors", _errors(content["errors"])),
         section("Checks", _checks(checks(result))),
         section("Model", _model(content["model"])),
@@ -176,9 +151,9 @@ def _opening(title: str, content: dict[str, Any], result: Result) -> str:
             f"states that did converge. {escape(reason[:1].upper() + reason[1:])}</div>"
         )
     boxes = [
-        f"<div><b>{escape(number(final.get(key), key))}</b>{escape(label)}</div>"
-        for key, label in HEADLINES
-        if final.get(key) is not None
+        f"<div><b>{escape(number(final[figure.key], figure.key))}</b>{escape(figure.label)}</div>"
+        for figure in shown_in("headlines")
+        if final.get(figure.key) is not None
     ]
     return "\n".join(lines) + (f'\n<div class="headlines">{"".join(boxes)}</div>' if boxes else "")
 
@@ -197,7 +172,8 @@ def figure_section(plates: Iterable[tuple[Plate, bytes]]) -> str:
     return section("Figures", "\n".join(parts))
 
 
-def _numbers(content: dict[str, Any], layers: list[str]) -> str:
+def _numbers(content: dict[str, Any], result: Result) -> str:
+    layers, symmetry = result.model.marks.layer_names, result.model.symmetry
     final, body = content["final"], (content["history"] or [{}])[0]
     rows = [
         ["lumen radius, load-free", number(content["load_free"]["lumen_radius_mm"], "_mm"), "–"],
@@ -205,23 +181,30 @@ def _numbers(content: dict[str, Any], layers: list[str]) -> str:
     ]
     parts = [table(["before clamping", "value"], [row[:2] for row in rows])]
     if final:
-        rows = [[label, number(body.get(key), key), number(final.get(key), key)] for key, label in NUMBERS]
+        shown = [(figure.key, figure.label) for figure in shown_in("numbers")]
+        rows = [[label, number(body.get(key), key), number(final.get(key), key)] for key, label in shown]
         parts.append(table(["", "in the body", "last state"], rows))
         rows = [
-            [f"{label} (kPa)", *(number(final[key].get(name)) for name in layers)]
-            for key, label in PEAKS
-            if final.get(key)
+            [f"{figure.label} ({figure.unit})", *(number(final[figure.key].get(name)) for name in layers)]
+            for figure in shown_in("peaks")
+            if final.get(figure.key)
         ]
         places = final.get("peak_axial_stress_location_mm") or {}
         at = ["place of the axial peak: x, y, z (mm)"]
-        at += [", ".join(f"{abs(c):.2f}" for c in places.get(name) or []) for name in layers]
+        at += [_place(places.get(name) or (), symmetry) for name in layers]
         parts.append(table(["highest stress in the last state", *layers], [*rows, at]))
         parts.append(
             '<p class="faint">Lumen sizes are those of the whole artery at mid-length. Peaks are over the '
             "quadrature points; x runs along the fold axis, y along the compression axis, z along the "
-            "artery, and each place stands for its mirror images too.</p>"
+            "artery, and each place stands for its mirror images in the planes of the model too.</p>"
         )
     return "\n".join(parts)
+
+
+def _place(place: Sequence[float], symmetry: Symmetry) -> str:
+    """Coordinates x, y, z, mm; of mirror images the one on the positive side."""
+    known = zip(place, AXES, strict=False)
+    return ", ".join(f"{abs(c) if axis in symmetry else c:z.2f}" for c, axis in known)
 
 
 def _errors(errors: dict[str, dict[str, float | None]] | None) -> str:
@@ -257,7 +240,7 @@ def checks(result: Result) -> list[tuple[str, str, str, bool]]:
     deepest, smallest, largest = 0.05 * wall, *_volume_ratios(result)
     rows: list[tuple[str, str, Any, str, Callable[[Any], bool]]] = [
         (
-            "jaw force against the symmetry plane, relative",
+            "balance of vertical forces, relative",
             "",
             solver["force_balance_error"],
             "below 1e-6",
@@ -314,7 +297,7 @@ def _checks(found: list[tuple[str, str, str, bool]]) -> str:
 
 def _model(model: dict[str, Any]) -> str:
     said = {
-        "symmetry": "modelled part",
+        "modelled": "modelled part",
         "elements": "elements",
         "element": "element",
         "unknowns": "unknowns",

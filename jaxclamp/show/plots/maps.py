@@ -9,7 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
-from jaxclamp.show.fields import LayerFields, layer_fields, layer_nodes
+from jaxclamp.show.fields import LayerFields, WholeGrid, layer_fields, whole_grid, whole_positions
 from jaxclamp.show.plots.states import Clamped, final_state
 from jaxclamp.show.plots.style import INK, NORMAL, SMALL, Picture, dress, nice_limits, plain, stress_colours
 
@@ -18,6 +18,8 @@ FROM_INSIDE, FROM_OUTSIDE = (0.50, -0.75, 0.32), (0.50, 0.75, 0.32)
 """where the observer stands: across the artery, above the jaws' mid-plane, along the artery"""
 FINER = 4
 """drawn facets per facet of the mesh and direction"""
+EQUALLY_HIGH = 1e-6
+"""stresses of mirror images differ by no more than this part, computed or mirrored"""
 
 
 def plot_axial_stress_maps(result: Clamped) -> Picture:
@@ -32,8 +34,7 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
     figure = Picture(9.6, 2.75 * len(layers) + 0.35)
     grid = figure.add_gridspec(len(layers), 2, width_ratios=[1.0, 1.25])
     for number, layer in enumerate(layers):
-        first, end = result.model.mesh.layer_cells[number]
-        P = first <= result.model.marks.P_cell < end
+        P = number == result.model.marks.P_layer
         map_axes, view_axes = (figure.add_subplot(grid[number, column]) for column in (0, 1))
         unrolled(map_axes, layer, load_free_angles(result, number), zoom, scale, P)
         last = number == len(layers) - 1
@@ -44,7 +45,7 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
             f"{plain(layer.name)}, highest through the layer",
             grid=False,
         )
-        _view(view_axes, layer, zoom, scale, inside=number == 0, mark_P=P)
+        _view(view_axes, whole_grid(layer), zoom, scale, inside=number == 0, mark_P=P)
     bar = figure.colorbar(scale, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
     bar.set_label("axial Cauchy stress (kPa)", fontsize=NORMAL, color=INK)
     bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
@@ -54,7 +55,7 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
 
 def half_length_shown(result: Clamped, layers: tuple[LayerFields, ...]) -> float:
     """Half the length of artery shown, mm."""
-    size = float(np.max(layers[-1].points[:, 0]))
+    size = float(np.max(np.abs(layers[-1].points[:, 0])))
     end = float(np.max(layers[-1].points[:, 2]))
     return min(float(result.scene.clamp.jaw.half_extent()) + size, 2.5 * size, end)
 
@@ -63,30 +64,28 @@ def half_length_shown(result: Clamped, layers: tuple[LayerFields, ...]) -> float
 
 
 def load_free_angles(result: Clamped, layer: int) -> np.ndarray:
-    """Angle of the circumferential grid lines in the load-free tube, deg, (n_c,)."""
+    """Angle of the circumferential grid lines of the upper half in the load-free tube, deg, (n,)."""
     assert result.load_free is not None
-    grid = result.model.mesh.grid
-    x = np.asarray(result.load_free.state.x)[layer_nodes(result.model.mesh, layer)]
-    quarter = x.reshape(grid[2], grid[1], -1, 3)[0, :, 0]
-    return np.degrees(np.arctan2(quarter[:, 1], quarter[:, 0]))
+    grid = whole_positions(result.model, result.load_free.state, layer)
+    x, y, _ = grid.points[grid.middle, grid.upper, 0].T
+    return np.degrees(np.unwrap(np.arctan2(y, x)))
 
 
 def unrolled(
     axes: Axes, layer: LayerFields, angles: np.ndarray, zoom: float, scale: ScalarMappable, mark_P: bool
 ) -> None:
-    """Angle in the load-free tube (fold, jaw, fold) against current position along the artery."""
-    stress = layer.on_grid(layer.point_data[FIELD])
+    """Angle in the load-free tube (fold, jaw, fold) against current position along the artery.
+
+    angles: from `load_free_angles`, deg, (n,); zoom: half the length shown, mm
+    """
+    grid = whole_grid(layer)
+    stress = grid.point_data[FIELD][:, grid.upper]
     highest = np.argmax(stress, axis=2)[..., None]
     value = np.take_along_axis(stress, highest, axis=2)[..., 0]
-    z = np.take_along_axis(layer.on_grid(layer.points)[..., 2], highest, axis=2)[..., 0]
+    z = np.take_along_axis(grid.points[:, grid.upper, :, 2], highest, axis=2)[..., 0]
     angle = np.broadcast_to(angles, value.shape)
-    place = np.unravel_index(np.argmax(np.where(z <= zoom, value, -np.inf)), value.shape)
-    peaks = [(side * z[place], a) for side in (1, -1) for a in (angle[place], 180.0 - angle[place])]
-
-    value, z, angle = (np.concatenate([sign * v[:0:-1], v]) for v, sign in ((value, 1), (z, -1), (angle, 1)))
-    value, z, angle = (
-        np.concatenate([v, w[:, -2::-1]], axis=1) for v, w in ((value, value), (z, z), (angle, 180.0 - angle))
-    )
+    inside = np.where(np.abs(z) <= zoom, value, -np.inf)
+    peaks = inside >= np.max(inside) - EQUALLY_HIGH * np.max(np.abs(value))
     axes.pcolormesh(
         z,
         angle,
@@ -100,7 +99,13 @@ def unrolled(
     axes.set_ylim(0.0, 180.0)
     axes.set_yticks([0, 45, 90, 135, 180], ["0, fold", "45", "90, jaw", "135", "180, fold"])
     axes.plot(
-        *np.transpose(peaks), "x", color="white", markersize=6, markeredgewidth=1.6, path_effects=_outlined()
+        z[peaks],
+        angle[peaks],
+        "x",
+        color="white",
+        markersize=6,
+        markeredgewidth=1.6,
+        path_effects=_outlined(),
     )
     if mark_P:
         _P(axes, 0.0, 90.0)
@@ -129,7 +134,7 @@ def _P(axes: Axes, x: float, y: float) -> None:
 
 
 def _view(
-    axes: Axes, layer: LayerFields, zoom: float, scale: ScalarMappable, inside: bool, mark_P: bool
+    axes: Axes, layer: WholeGrid, zoom: float, scale: ScalarMappable, inside: bool, mark_P: bool
 ) -> None:
     """The upper half of a layer, shaded, from the lumen or from outside."""
     camera = _camera(FROM_INSIDE if inside else FROM_OUTSIDE)
@@ -162,7 +167,7 @@ def _view(
         loc="left",
     )
     if mark_P and inside:
-        P = layer.on_grid(layer.points)[0, -1, 0]
+        P = layer.points[layer.middle, layer.line(1), 0]
         _P(axes, *(camera[:2] @ P))
 
 
@@ -175,13 +180,9 @@ def _camera(toward: tuple[float, float, float]) -> np.ndarray:
     return np.stack([right, np.cross(back, right), back])
 
 
-def _shell(layer: LayerFields, zoom: float) -> tuple[np.ndarray, np.ndarray]:
+def _shell(layer: WholeGrid, zoom: float) -> tuple[np.ndarray, np.ndarray]:
     """Facets of the upper half's surface: corners anticlockwise from outside (n, 4, 3), values (n,)."""
-    block = np.concatenate(
-        [layer.on_grid(layer.points), layer.on_grid(layer.point_data[FIELD])[..., None]], axis=-1
-    )
-    block = np.concatenate([block[:0:-1] * [1, 1, -1, 1], block])
-    block = np.concatenate([block, block[:, -2::-1] * [-1, 1, 1, 1]], axis=1)
+    block = np.concatenate([layer.points, layer.point_data[FIELD][..., None]], axis=-1)[:, layer.upper]
     block = _refined(_refined(block, 0), 1)
     keep = np.flatnonzero(np.max(np.abs(block[..., 2]), axis=(1, 2)) <= zoom)
     block = block[keep[0] : keep[-1] + 1]

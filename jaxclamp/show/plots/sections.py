@@ -8,14 +8,13 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
 
-from jaxclamp.show.fields import jaw_height_shown, jaw_outline, layer_nodes
+from jaxclamp.show.fields import WholeGrid, jaw_height_shown, jaw_outline, whole_positions
 from jaxclamp.show.plots.states import Clamped, shown_states
 from jaxclamp.show.plots.style import INK, JAW, JAW_EDGE, LARGE, SMALL, Picture, layer_colour, plain
 
 COLUMNS = 2
 WIDTH = 10.5
 """inches"""
-MIRRORS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 
 
 def plot_sections(result: Clamped) -> Picture:
@@ -39,7 +38,6 @@ def plot_sections(result: Clamped) -> Picture:
     for place, (letter, index) in enumerate(states.items()):
         kept, record = result.closing[index], result.history[index]
         row, column = divmod(place, COLUMNS)
-        x = np.asarray(kept.state.x)
         height = jaw_height_shown(model, kept.state, open_height)
         left = figure.add_subplot(grid[row, 3 * column])
         right = figure.add_subplot(grid[row, 3 * column + 1])
@@ -54,8 +52,9 @@ def plot_sections(result: Clamped) -> Picture:
                 )
             )
         for number in range(len(result.scene.artery.layers)):
-            _cross_section(left, result, x, number)
-            _longitudinal_section(right, result, x, number)
+            layer = whole_positions(model, kept.state, number)
+            _cross_section(left, layer, number)
+            _longitudinal_section(right, layer, number)
         _frame(left, across, up)
         _frame(right, along, up)
         left.set_title(letter, fontsize=LARGE, color=INK, loc="left", fontweight="bold")
@@ -67,10 +66,10 @@ def plot_sections(result: Clamped) -> Picture:
 
 def _largest(result: Clamped) -> tuple[float, float]:
     """Largest half width and half height of the artery at mid-length over the closing, mm."""
-    mesh = result.model.mesh
-    outer = [mesh.node(-1, c, 0) for c in range(mesh.grid[1])]
-    x = np.stack([np.asarray(kept.state.x)[outer] for kept in result.closing])
-    return float(np.max(x[..., 0])), float(np.max(x[..., 1]))
+    outermost = len(result.scene.artery.layers) - 1
+    grids = [whole_positions(result.model, kept.state, outermost) for kept in result.closing]
+    ring = np.abs([grid.points[grid.middle, :, -1] for grid in grids])
+    return float(np.max(ring[..., 0])), float(np.max(ring[..., 1]))
 
 
 def _bar(axes: Axes, face: float, back: float, across: float) -> None:
@@ -79,43 +78,28 @@ def _bar(axes: Axes, face: float, back: float, across: float) -> None:
     axes.add_patch(Polygon(corners, facecolor=JAW, edgecolor=JAW_EDGE, linewidth=0.9))
 
 
-def _plane_of_layer(result: Clamped, x: np.ndarray, layer: int) -> np.ndarray:
-    """Positions of a layer's nodes, (axial, circumferential, radial, 3)."""
-    grid = result.model.mesh.grid
-    return x[layer_nodes(result.model.mesh, layer)].reshape(grid[2], grid[1], -1, 3)
-
-
-def _cross_section(axes: Axes, result: Clamped, x: np.ndarray, layer: int) -> None:
-    points = _plane_of_layer(result, x, layer)[0, :, :, :2]
-    inner, outer = _ring(points[:, 0]), _ring(points[:, -1])
+def _cross_section(axes: Axes, layer: WholeGrid, number: int) -> None:
+    points = layer.points[layer.middle, :, :, :2]
+    inner, outer = points[:, 0], points[:, -1]
     codes = [Outline.MOVETO, *[Outline.LINETO] * (len(inner) - 2), Outline.CLOSEPOLY]
     path = Outline(np.concatenate([outer, inner[::-1]]), codes * 2)
-    fill, edge = layer_colour(layer)
+    fill, edge = layer_colour(number)
     axes.add_patch(PathPatch(path, facecolor=fill, edgecolor=edge, linewidth=0.8))
     _element_lines(axes, points, edge)
 
 
-def _ring(quarter: np.ndarray) -> np.ndarray:
-    """A closed curve from its first quadrant, which runs from the x axis to the y axis."""
-    left = quarter[-2::-1] * [-1, 1]
-    upper = np.concatenate([quarter, left])
-    return np.concatenate([upper, upper[-2::-1] * [1, -1]])
-
-
-def _longitudinal_section(axes: Axes, result: Clamped, x: np.ndarray, layer: int) -> None:
-    points = _plane_of_layer(result, x, layer)[:, -1][..., [2, 1]]
-    fill, edge = layer_colour(layer)
-    inner, outer = points[:, 0], points[:, -1]
-    band = np.concatenate([inner[::-1] * [-1, 1], inner[1:], outer[::-1], outer[1:] * [-1, 1]])
-    for side in (1, -1):
-        axes.add_patch(Polygon(band * [1, side], facecolor=fill, edgecolor=edge, linewidth=0.8))
-    _element_lines(axes, points, edge)
+def _longitudinal_section(axes: Axes, layer: WholeGrid, number: int) -> None:
+    fill, edge = layer_colour(number)
+    for quarter in (1, 3):  # under the upper jaw and over the lower one
+        points = layer.points[:, layer.line(quarter)][..., [2, 1]]
+        band = np.concatenate([points[:, 0], points[::-1, -1]])
+        axes.add_patch(Polygon(band, facecolor=fill, edgecolor=edge, linewidth=0.8))
+        _element_lines(axes, points, edge)
 
 
 def _element_lines(axes: Axes, points: np.ndarray, colour: str) -> None:
-    """Lines between elements, faint, in all four quadrants; points: (along, through, 2)."""
-    mirrored = [points * sign for sign in np.array(MIRRORS)]
-    lines = [line for p in mirrored for line in (*p, *np.swapaxes(p, 0, 1))]
+    """Lines between elements, faint; points: (along, through, 2)."""
+    lines = [*points, *np.swapaxes(points, 0, 1)]
     axes.add_collection(LineCollection(lines, colors=colour, linewidths=0.25, alpha=0.7))
 
 

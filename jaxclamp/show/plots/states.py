@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
-from jaxclamp.potential.tangent import State
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.show.fields import spread
 from jaxclamp.show.plots.style import letters

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
 
-from jaxclamp.show.fields import LayerFields, layer_fields
+from jaxclamp.show.fields import WholeGrid, layer_fields, whole_grid
 from jaxclamp.show.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
@@ -41,24 +41,26 @@ def plot_wall_stress(result: Clamped) -> Picture:
     figure = Picture(4.6 * len(panels), 3.6)
     for place, (title, kept) in enumerate(panels):
         axes = figure.add_subplot(1, len(panels), place + 1)
-        _through_wall(axes, layer_fields(result.model, kept.state))
+        layers = layer_fields(result.model, kept.state)
+        _through_wall(axes, {layer.name: whole_grid(layer) for layer in layers})
         dress(axes, "radius (mm)", "Cauchy stress (kPa)" if place == 0 else "", title)
     legend(figure.axes[0], loc="best")
     return figure
 
 
-def _through_wall(axes: Axes, layers: tuple[LayerFields, ...]) -> None:
+def _through_wall(axes: Axes, layers: dict[str, WholeGrid]) -> None:
     """Nodal stress against current radius, the layers shaded and named."""
     ends = []
-    for number, layer in enumerate(layers):
-        radius = layer.on_grid(layer.points)[0, -1, :, 1]
+    for number, (layer_name, grid) in enumerate(layers.items()):
+        place = grid.middle, grid.line(1)
+        radius = grid.points[place][:, 1]
         fill, edge = layer_colour(number)
         axes.axvspan(radius[0], radius[-1], color=fill, alpha=0.28, linewidth=0.0)
         ends += [radius[0], radius[-1]]
         for name, label, colour, line, marker in CURVES:
             axes.plot(
                 radius,
-                layer.on_grid(layer.point_data[name])[0, -1],
+                grid.point_data[name][place],
                 color=colour,
                 linestyle=line,
                 marker=marker,
@@ -69,7 +71,7 @@ def _through_wall(axes: Axes, layers: tuple[LayerFields, ...]) -> None:
         axes.text(
             0.5 * (radius[0] + radius[-1]),
             0.985,
-            plain(layer.name),
+            plain(layer_name),
             transform=axes.get_xaxis_transform(),
             ha="center",
             va="top",
