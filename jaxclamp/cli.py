@@ -224,8 +224,8 @@ def accuracy(
     loaded = _load(scene, fidelity, overrides, quiet)
     folder = out or Path(f"{Path(scene).stem}-accuracy")
     _check_folder(folder)
+    from jaxclamp.show.price_report import lines, write_prices
     from jaxclamp.trust.price_list import price_list
-    from jaxclamp.trust.price_report import lines, write_prices
 
     with console.progress(quiet) as progress:
         prices = price_list(loaded, progress if callable(progress) else None)

@@ -11,10 +11,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from jaxclamp import Result
-from jaxclamp.show.fields import layer_fields
-from jaxclamp.show.plots import Plate
-from jaxclamp.show.plots.maps import FIELD, half_length_shown, load_free_angles, unrolled
-from jaxclamp.show.plots.style import (
+from jaxclamp.pictures.fields import layer_fields
+from jaxclamp.pictures.plots import Plate
+from jaxclamp.pictures.plots.maps import FIELD, half_length_shown, load_free_angles, unrolled
+from jaxclamp.pictures.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
     FAINT,

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxclamp import Progress, dump_scene
+from jaxclamp.pictures.plots import Plate, png
 from jaxclamp.show.export import write_outputs
-from jaxclamp.show.plots import Plate, png
 from jaxclamp.show.report import document, figure_section, number, section, table
 from optimize.figures import figures, shown
 from optimize.journal import write_bytes, write_whole

@@ -25,7 +25,7 @@ from jaxclamp.show.paraview import FOLDER as STATES
 from jaxclamp.show.paraview import write_states
 
 if TYPE_CHECKING:
-    from jaxclamp.show.plots import Plate
+    from jaxclamp.pictures.plots import Plate
     from jaxclamp.solve.results import Result
 
 STAGING = ".jaxclamp-writing-"
@@ -65,7 +65,7 @@ def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) 
         yield from write_states(result, folder, lambda s, said: tell(0.5 * s, said))
     plates: list[tuple[Plate, bytes]] = []
     (folder / FIGURES).mkdir()
-    from jaxclamp.show.plots import figures, png
+    from jaxclamp.pictures.plots import figures, png
 
     for plate in figures(result):
         tell(0.5 + 0.1 * len(plates), plate.title.lower())
@@ -106,7 +106,7 @@ def _remove_old(folder: Path, files: list[Path]) -> None:
 
 def _own_files(folder: Path) -> Iterator[Path]:
     """The states and figures in a folder that bear names given here; a user's own files are others."""
-    from jaxclamp.show.plots import PLATES
+    from jaxclamp.pictures.plots import PLATES
 
     for part in ("artery", "jaws"):
         yield from (folder / STATES).glob(f"{part}_[0-9][0-9][0-9].vtu")

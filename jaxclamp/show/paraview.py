@@ -13,8 +13,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from jaxclamp.pictures.fields import jaw_height_shown, jaw_outline, layer_fields, whole
 from jaxclamp.potential.model import Model
-from jaxclamp.show.fields import jaw_height_shown, jaw_outline, layer_fields, whole
 
 if TYPE_CHECKING:
     from jaxclamp.solve.results import Kept, Result

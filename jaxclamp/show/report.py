@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from jaxclamp.fem.symmetry import AXES, Symmetry
 from jaxclamp.observe.figures import shown_in
+from jaxclamp.pictures.fields import layer_fields
 from jaxclamp.show.console import name_and_unit
-from jaxclamp.show.fields import layer_fields
 from jaxclamp.trust.estimates import SOURCES
 
 if TYPE_CHECKING:
-    from jaxclamp.show.plots import Plate
+    from jaxclamp.pictures.plots import Plate
     from jaxclamp.solve.results import Result
 
 UNITS = {"mm": "mm", "mm2": "mm²", "kPa": "kPa", "N": "N", "mN": "mN", "uJ": "µJ", "s": "s", "MB": "MB"}
@@ -65,7 +65,7 @@ pre { background: var(--card); border-radius: 6px; padding: 1rem; white-space: p
 def write_report(result: Result, path: Path, plates: Iterable[tuple[Plate, bytes]] | None = None) -> Path:
     """Write the page; `plates` are figures with their PNG files, drawn here if not given."""
     if plates is None:
-        from jaxclamp.show.plots import figures, png
+        from jaxclamp.pictures.plots import figures, png
 
         plates = [(plate, png(plate.figure)) for plate in figures(result)]
     path.write_text(page(result, plates), encoding="utf-8")

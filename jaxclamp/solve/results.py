@@ -20,7 +20,7 @@ from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.newton import Equilibrium
 
 if TYPE_CHECKING:
-    from jaxclamp.show.plots import Picture
+    from jaxclamp.pictures.plots import Picture
 
 
 FINAL_KEYS = tuple(figure.key for figure in FIGURES if figure.contract)
@@ -181,31 +181,31 @@ class Result:
 
     def plot_wall_stress(self) -> Picture:
         """Circumferential and axial stress through the wall, load-free and in the body."""
-        from jaxclamp.show import plots
+        from jaxclamp.pictures import plots
 
         return plots.plot_wall_stress(self)
 
     def plot_sections(self) -> Picture:
         """Deformed cross-sections and longitudinal sections with the jaws, states A to F."""
-        from jaxclamp.show import plots
+        from jaxclamp.pictures import plots
 
         return plots.plot_sections(self)
 
     def plot_stress_at_P(self) -> Picture:
         """Normalised axial and circumferential stress at P against jaw travel."""
-        from jaxclamp.show import plots
+        from jaxclamp.pictures import plots
 
         return plots.plot_stress_at_P(self)
 
     def plot_axial_stress_maps(self) -> Picture:
         """Axial stress of every layer in the last state."""
-        from jaxclamp.show import plots
+        from jaxclamp.pictures import plots
 
         return plots.plot_axial_stress_maps(self)
 
     def plot_force_travel(self) -> Picture:
         """Jaw force and occlusion against jaw travel."""
-        from jaxclamp.show import plots
+        from jaxclamp.pictures import plots
 
         return plots.plot_force_travel(self)
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from matplotlib.axes import Axes
 
-from jaxclamp.show.fields import WholeGrid, layer_fields, whole_grid
-from jaxclamp.show.plots.style import (
+from jaxclamp.pictures.fields import WholeGrid, layer_fields, whole_grid
+from jaxclamp.pictures.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
     FAINT,
@@ -21,7 +21,7 @@ from jaxclamp.show.plots.style import (
 )
 
 if TYPE_CHECKING:
-    from jaxclamp.show.plots.states import Clamped
+    from jaxclamp.pictures.plots.states import Clamped
 
 CURVES = (
     ("circumferential_stress_kPa", "circumferential", CIRCUMFERENTIAL, "-", "o"),

@@ -6,7 +6,7 @@ import dataclasses
 
 from matplotlib.ticker import NullFormatter
 
-from jaxclamp.show.plots.style import FAINT, INK, LAYER_EDGES, SMALL, Picture, dress
+from jaxclamp.pictures.plots.style import FAINT, INK, LAYER_EDGES, SMALL, Picture, dress
 
 MARKERS = "osD^v<>P*Xph"
 COLUMNS = 3

@@ -8,9 +8,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
 
-from jaxclamp.show.fields import WholeGrid, jaw_height_shown, jaw_outline, whole_positions
-from jaxclamp.show.plots.states import Clamped, shown_states
-from jaxclamp.show.plots.style import INK, JAW, JAW_EDGE, LARGE, SMALL, Picture, layer_colour, plain
+from jaxclamp.pictures.fields import WholeGrid, jaw_height_shown, jaw_outline, whole_positions
+from jaxclamp.pictures.plots.states import Clamped, shown_states
+from jaxclamp.pictures.plots.style import INK, JAW, JAW_EDGE, LARGE, SMALL, Picture, layer_colour, plain
 
 COLUMNS = 2
 WIDTH = 10.5

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from jaxclamp.pictures.fields import spread
+from jaxclamp.pictures.plots.style import letters
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.scenes.scene import Scene
-from jaxclamp.show.fields import spread
-from jaxclamp.show.plots.style import letters
 
 SHOWN = 6
 """states A to F"""

@@ -8,12 +8,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-from jaxclamp.show.plots.curves import plot_force_travel, plot_stress_at_P
-from jaxclamp.show.plots.maps import plot_axial_stress_maps
-from jaxclamp.show.plots.sections import plot_sections
-from jaxclamp.show.plots.states import Clamped
-from jaxclamp.show.plots.style import Picture, png
-from jaxclamp.show.plots.wall import plot_wall_stress
+from jaxclamp.pictures.plots.curves import plot_force_travel, plot_stress_at_P
+from jaxclamp.pictures.plots.maps import plot_axial_stress_maps
+from jaxclamp.pictures.plots.sections import plot_sections
+from jaxclamp.pictures.plots.states import Clamped
+from jaxclamp.pictures.plots.style import Picture, png
+from jaxclamp.pictures.plots.wall import plot_wall_stress
 
 __all__ = [
     "Picture",

@@ -14,7 +14,7 @@ import pytest
 
 import jaxclamp
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 LEVEL = {
     "drivers": 0,
@@ -61,13 +61,19 @@ def imported(tree: ast.AST) -> list[tuple[str, str]]:
             aliases |= {alias.asname or alias.name: alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             found += [("." * node.level + (node.module or ""), alias.name) for alias in node.names]
-            aliases |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+            modules = [alias for alias in node.names if _is_module(f"{node.module}.{alias.name}")]
+            aliases |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in modules}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in aliases:
             module = aliases[node.value.id]
             if module.partition(".")[0] in ("jaxclamp", "optimize"):
                 found.append((module, node.attr))
     return found
+
+
+def _is_module(dotted: str) -> bool:
+    path = ROOT.joinpath(*dotted.split("."))
+    return path.is_dir() or path.with_suffix(".py").exists()
 
 
 def faults(name: str, source: str) -> list[str]:

@@ -9,9 +9,18 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
-from jaxclamp.show.fields import LayerFields, WholeGrid, layer_fields, whole_grid, whole_positions
-from jaxclamp.show.plots.states import Clamped, final_state
-from jaxclamp.show.plots.style import INK, NORMAL, SMALL, Picture, dress, nice_limits, plain, stress_colours
+from jaxclamp.pictures.fields import LayerFields, WholeGrid, layer_fields, whole_grid, whole_positions
+from jaxclamp.pictures.plots.states import Clamped, final_state
+from jaxclamp.pictures.plots.style import (
+    INK,
+    NORMAL,
+    SMALL,
+    Picture,
+    dress,
+    nice_limits,
+    plain,
+    stress_colours,
+)
 
 FIELD = "axial_stress_kPa"
 FROM_INSIDE, FROM_OUTSIDE = (0.50, -0.75, 0.32), (0.50, 0.75, 0.32)

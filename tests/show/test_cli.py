@@ -111,7 +111,7 @@ def call(capsys, *arguments):
 
 
 def command(*arguments, cwd):
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     environment = os.environ | {"PYTHONPATH": str(root)}
     return subprocess.run(
         [sys.executable, "-m", "jaxclamp", *arguments],
@@ -400,7 +400,7 @@ def test_wrong_input_as_a_program(tmp_path):
 
 
 def test_a_reader_that_goes_away_is_no_error(tmp_path):
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     read_end, write_end = os.pipe()
     os.close(read_end)
     done = subprocess.run(

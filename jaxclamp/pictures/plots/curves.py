@@ -7,8 +7,8 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from jaxclamp.show.plots.states import Clamped, shown_states
-from jaxclamp.show.plots.style import (
+from jaxclamp.pictures.plots.states import Clamped, shown_states
+from jaxclamp.pictures.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
     FAINT,

@@ -11,9 +11,9 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
+from jaxclamp.show.price_report import lines, markdown, write_prices
 from jaxclamp.trust import price_list as accuracy
 from jaxclamp.trust.price_list import GRADIENT, Price, PriceList, ladder, richardson, scaled
-from jaxclamp.trust.price_report import lines, markdown, write_prices
 
 SIZES = [1.0, 2 / 3, 0.5]
 TINY = ["mesh.circumferential=3", "mesh.axial=4", "mesh.radial=[1, 1]"]

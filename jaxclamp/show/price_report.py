@@ -8,10 +8,10 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from jaxclamp.pictures.plots.accuracy import Panel, plot_prices
+from jaxclamp.pictures.plots.style import png
 from jaxclamp.show.console import as_json, name_and_unit
 from jaxclamp.show.export import STAGING, into_place
-from jaxclamp.show.plots.accuracy import Panel, plot_prices
-from jaxclamp.show.plots.style import png
 from jaxclamp.solve.results import versions
 from jaxclamp.trust.estimates import SOURCES
 from jaxclamp.trust.price_list import GRADIENT, Price, PriceList, machine
