@@ -44,7 +44,8 @@ CONFINED = {
     "matplotlib": {"figures"},
 }
 
-DRAWING_ROOM = "jaxclamp.show"
+OPEN_ROOMS = ("jaxclamp.scenes", "jaxclamp.pictures", "jaxclamp.show")
+"""rooms of data and of what is shown, beside the names of jaxclamp itself"""
 MOST_LINES = 400
 
 
@@ -114,11 +115,10 @@ def _not_public(name: str, module: str, what: str) -> str | None:
     if module == "jaxclamp":
         known = not what or what in jaxclamp.__all__
         return None if known else f"{name} imports {what}, which is not in jaxclamp.__all__"
-    if any(map(is_private, (*module.split("."), what))):
-        return f"{name} imports {what} of {module}, which is private"
-    if module.removeprefix("jaxclamp.") in jaxclamp.__all__ or f"{module}.".startswith(f"{DRAWING_ROOM}."):
-        return None
-    return f"{name} imports {module}: take public names from jaxclamp or {DRAWING_ROOM}"
+    if not any(f"{module}.".startswith(f"{room}.") for room in OPEN_ROOMS):
+        return f"{name} imports {module}: take public names from jaxclamp or {', '.join(OPEN_ROOMS)}"
+    private = any(part.startswith("_") for part in (*module.split("."), what))
+    return f"{name} imports {what} of {module}, which is private" if private else None
 
 
 def source(name: str) -> str:
@@ -201,7 +201,7 @@ def test_public_names_of_jaxclamp_exist(name):
         ("import jaxclamp as jc\njc.solve.clamping.clamp", "not in jaxclamp.__all__"),
         ("from jaxclamp.show.console import _finite", "is private"),
         ("from jaxclamp.show import console\nconsole._finite(1.0)", "is private"),
-        ("from jaxclamp import Result\nResult._stage", "is private"),
+        ("from jaxclamp import Result\nResult._stage", "take public names"),
         ("from jaxclamp.showroom import lamp", "take public names"),
         ("import jaxopt", "is for drivers"),
         ("from scipy.optimize import minimize", "is for drivers"),
