@@ -227,3 +227,21 @@ class Compressible:
             stresses.append(self._stress(layer, self._radial_stretch(layer, hoop, s), hoop))
         theta, axial, radial = np.array(stresses).T
         return Profile(r, theta, axial, radial)
+
+
+def random_sectors(seed: int) -> tuple[tuple[Sector, Sector], float, float]:
+    """Two layers that fit round each other within 3 %, pressure and stretch, at random."""
+    rng = np.random.default_rng(seed)
+
+    def material() -> tuple[float, float, float, float]:
+        return rng.uniform(10.0, 60.0), rng.uniform(0.5, 8.0), rng.uniform(1.0, 10.0), rng.uniform(5.0, 50.0)
+
+    inner = Sector(rng.uniform(2.0, 4.0), rng.uniform(0.3, 0.6), rng.uniform(0.0, 160.0), *material())
+    closed_outer = (inner.inner_radius + 0.5 * inner.thickness) / inner.k + 0.5 * inner.thickness
+    angle, thickness = rng.uniform(0.0, 160.0), rng.uniform(0.15, 0.35)
+    k = 360.0 / (360.0 - angle)
+    fit = rng.uniform(0.97, 1.03)
+    outer = Sector(
+        fit * (closed_outer + 0.5 * thickness) * k - 0.5 * thickness, thickness, angle, *material()
+    )
+    return (inner, outer), rng.uniform(6.0, 16.0), rng.uniform(1.0, 1.25)

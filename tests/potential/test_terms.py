@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxclamp.show.description import describe
 
 import jaxclamp as jc
 from jaxclamp.fem.tube import closed_positions
@@ -21,6 +20,7 @@ from jaxclamp.potential.energy import with_equilibrium_pressure
 from jaxclamp.potential.model import Model, build_model, potential_of
 from jaxclamp.potential.tangent import assemble, cut, linearise, linearise_piece
 from jaxclamp.potential.terms import BLOOD, INTIMA, JAWS, KEPT_VOLUME, Kind, Term, needed
+from jaxclamp.show.description import describe
 from jaxclamp.solve.stages import Clamping
 from tube import MEDIA
 from walks import material

@@ -90,7 +90,8 @@ def test_what_is_no_list_of_measures_is_refused(measures, said):
     ],
 )
 def test_what_is_no_address_of_a_float_is_refused(path):
-    with pytest.raises(jc.SceneError, match="expected a number of the scene|does not exist|is not an address"):
+    said = r"expected a number of the scene|does not exist|is not an address"
+    with pytest.raises(jc.SceneError, match=said):
         jc.gradients(clamped(), MEASURES, [path])
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
+from directions import dot, drawn, moved, tight
 from jaxclamp.scenes.files import loads_scene
 from jaxclamp.sensitivity.implicit import implicit, register, see, solution
 from jaxclamp.solve.clamping import inflate
@@ -66,11 +67,6 @@ GRADING = "mesh.circumferential_grading=0.5"
 """inside its range: differences go both ways"""
 
 
-def tight(scene: jc.Scene) -> jc.Scene:
-    """Converged as far as float64 allows, so that differences are not noise."""
-    return dataclasses.replace(scene, solver=dataclasses.replace(scene.solver, tolerance=1e-12))
-
-
 @functools.cache
 def clamped(stop: str) -> jc.Result:
     if stop == "one layer":
@@ -98,38 +94,6 @@ def one_layer() -> jc.Result:
     artery = dataclasses.replace(scene.artery, layers=scene.artery.layers[:1])
     text = jc.dump_scene(dataclasses.replace(scene, artery=artery, mesh=mesh("q1p0", 4, 6, (2,))))
     return jc.clamp(tight(loads_scene(text, overrides=[*counts, STOPS["half closed"], GRADING])))
-
-
-def moved(scene: jc.Scene, direction: jc.Scene, h: float) -> jc.Scene:
-    return jax.tree_util.tree_map(lambda a, d: np.asarray(a) + h * np.asarray(d), scene, direction)
-
-
-def drawn(scene: jc.Scene, paths: tuple[str, ...], seed: int) -> jc.Scene:
-    """A random direction in the given parts of a scene, in proportion to the values; zero elsewhere."""
-    rng = np.random.default_rng(seed)
-    direction = jax.tree_util.tree_map(lambda a: np.zeros(np.shape(a)), scene)
-    for path in paths:
-        part = functools.reduce(step, path.split("."), scene)
-        random = jax.tree_util.tree_map(
-            lambda a: rng.uniform(-1.0, 1.0, np.shape(a)) * np.maximum(np.abs(a), 1e-3), part
-        )
-        direction = jc.replace(direction, path, random)
-    return direction
-
-
-def step(node, name: str):
-    head, _, index = name.partition("[")
-    return getattr(node, head)[int(index[:-1])] if index else getattr(node, head)
-
-
-@functools.cache
-def gradient_of(stop: str, measure: jc.Measure) -> tuple[float, jc.Scene]:
-    return jc.value_and_gradient(clamped(stop), measure)
-
-
-def dot(a: jc.Scene, b: jc.Scene) -> float:
-    pairs = zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True)
-    return float(sum(np.vdot(np.asarray(x), np.asarray(y)) for x, y in pairs))
 
 
 @pytest.mark.parametrize("family", FAMILIES)

@@ -22,9 +22,10 @@ from jaxclamp.core.failures import EquilibriumError, NotConverged
 from jaxclamp.fem.tube import closed_positions
 from jaxclamp.observe.figures import shown_in
 from jaxclamp.observe.stresses import stresses
+from jaxclamp.pictures import fields, plots
 from jaxclamp.potential.energy import with_equilibrium_pressure
 from jaxclamp.potential.model import build_model
-from jaxclamp.show import export, fields, paraview, plots
+from jaxclamp.show import export, paraview
 from jaxclamp.show.report import page, write_report
 
 meshio = pytest.importorskip("meshio")

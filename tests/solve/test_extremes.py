@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import jaxclamp as jc
+from directions import dot, drawn, moved, tight
 from extremes import (
     AXES,
     Outcome,
@@ -25,7 +26,6 @@ from extremes import (
     random_points,
     scene_of,
 )
-from test_sensitivity import dot, drawn, moved, tight
 
 LEAST_SOLVED = 0.97
 """of the sensible box"""
