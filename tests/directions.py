@@ -38,11 +38,6 @@ def step(node, name: str):
     return getattr(node, head)[int(index[:-1])] if index else getattr(node, head)
 
 
-@functools.cache
-def gradient_of(stop: str, measure: jc.Measure) -> tuple[float, jc.Scene]:
-    return jc.value_and_gradient(clamped(stop), measure)
-
-
 def dot(a: jc.Scene, b: jc.Scene) -> float:
     pairs = zip(jax.tree_util.tree_leaves(a), jax.tree_util.tree_leaves(b), strict=True)
     return float(sum(np.vdot(np.asarray(x), np.asarray(y)) for x, y in pairs))

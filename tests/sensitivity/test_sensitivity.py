@@ -96,6 +96,11 @@ def one_layer() -> jc.Result:
     return jc.clamp(tight(loads_scene(text, overrides=[*counts, STOPS["half closed"], GRADING])))
 
 
+@functools.cache
+def gradient_of(stop: str, measure: jc.Measure) -> tuple[float, jc.Scene]:
+    return jc.value_and_gradient(clamped(stop), measure)
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_gradient_of_the_peak(family):
     """One layer, one measure; the full set is slow because of what it compiles."""
