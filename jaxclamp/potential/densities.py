@@ -56,9 +56,10 @@ def dilatation(y: Tensor, here: Solid) -> Array:
     return (det(y) * det(here.to_local) - 1.0) * here.dV
 
 
-def pressure_work(y: Tensor, p: Array, here: Solid) -> Array:
-    """p (J - 1) dV; p: pressure interpolated at the points, kPa, (n_q, n_cells)."""
-    return p * (det(deformation(y, here)) - 1.0) * here.dV
+def mixed_energy(y: Tensor, p: Array, here: Solid) -> Array:
+    """[psi_bar(F) + p (J - 1)] dV: the wall with the pressure p of its cells, kPa, (n_q, n_cells)."""
+    F = deformation(y, here)
+    return (here.material.psi_bar(F) + p * (det(F) - 1.0)) * here.dV
 
 
 @record

@@ -18,7 +18,7 @@ from jax import Array
 from jaxclamp.core.records import record, static
 from jaxclamp.core.tensors import Tensor, det, pointwise_derivatives, stacked, total
 from jaxclamp.fem.pattern import PAIRS, Layout
-from jaxclamp.potential.densities import RIGID, Density, Solid, dilatation, pressure_work
+from jaxclamp.potential.densities import RIGID, Density, Solid, dilatation, mixed_energy
 from jaxclamp.potential.energy import (
     AnyArray,
     State,
@@ -202,10 +202,11 @@ def linearise_piece(piece: Piece) -> Linearised:
 
     def density(v: list[Array]) -> Array:
         at, q = dict(zip(names, v[: len(names)], strict=True)), v[len(names) :] or piece.q
-        known = zip(piece.densities, piece.heres, strict=True)
-        terms = [one(at, q, here) for one, here in known]
-        if piece.pressures is not None:
-            terms.append(pressure_work(at, _interpolated(piece.pressures), piece.heres[0]))
+        known = list(zip(piece.densities, piece.heres, strict=True))
+        terms = []
+        if piece.pressures is not None:  # the solid comes first, and its pressures with it
+            terms.append(mixed_energy(at, _interpolated(piece.pressures), known.pop(0)[1]))
+        terms += [one(at, q, here) for one, here in known]
         return total(terms)
 
     value, first, second = pointwise_derivatives(density, [*y.values(), *moving])

@@ -185,6 +185,10 @@ class Potential:
         pairs = zip(self.groups, data, strict=True)
         return dataclasses.replace(self, groups=tuple(filled(group, *each) for group, each in pairs))
 
+    def with_clamp_data(self, data: tuple[tuple[tuple[Any, ...], Array | None], ...]) -> Potential:
+        """The potential with other floats in its contact terms, of the form of `clamp.data`."""
+        return dataclasses.replace(self, groups=self.artery.groups + self.clamp.with_data(data).groups)
+
     def at_pressure(self, pressure: Array | float) -> Potential:
         """The potential with another blood pressure, kPa."""
         return self.changed(BLOOD, lambda here: dataclasses.replace(here, pressure=jnp.asarray(pressure)))

@@ -179,3 +179,79 @@ def _by_scene(
     ]
     gradient: Scene = jax.vjp(sizes, scene)[1]((of_sizes, of_pieces))[0]
     return gradient
+
+
+# --- by the clamp alone: a design of jaws needs no more ------------------------------------------------
+
+
+def value_and_clamp_gradient(result: Result, measure: Measure) -> tuple[float, Scene]:
+    """The same with derivatives by clamp, contact and stop alone, 0 elsewhere: a small part of the work.
+
+    The artery in the body does not depend on them, and the wall knows nothing of them.
+    """
+    known = solution(result, to_stop=True)
+    d, potential = result.model.discretisation, result.model.potential
+    free = np.asarray(d.layout.free)
+    last = result.states[-1].state
+    assert result.physiological is not None
+    scene = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), result.scene)
+    at = Sizes(
+        data=potential.clamp.data,
+        stop=scene.stop,
+        x_body=result.physiological.state.x,
+        x_stop=last.x,
+        q=last.q,
+    )
+    value, slopes = _measured_by_clamp(measure, potential, d.marks, at)
+    right: Any = np.asarray(slopes.x_stop).reshape(-1)[free]
+    by_q: Any = np.asarray(slopes.q)
+    if not np.any(right) and not np.any(by_q):  # a measure of the jaw alone
+        return float(value), _by_clamp(d, scene, slopes, jax.tree_util.tree_map(jnp.zeros_like, at))
+    y = solve_linear(known, Unknowns(physiological=None, stop=right, q=by_q), transposed=True)
+    y_stop = on_nodes(d.layout, jnp.asarray(y.stop))
+    touch = _clamp_work(potential, d.marks, at, y_stop, jnp.asarray(y.q))
+    return float(value), _by_clamp(d, scene, slopes, touch)
+
+
+@partial(jax.jit, static_argnums=0)
+def _measured_by_clamp(
+    measure: Measure, potential: Potential, marks: Landmarks, at: Sizes
+) -> tuple[Array, Sizes]:
+    def of(sizes: Sizes) -> Array:
+        same = potential.with_clamp_data(sizes.data)
+        in_body = settled(same, at.x_body, jnp.zeros_like(sizes.q))
+        closed = settled(same, sizes.x_stop, sizes.q)
+        return measure(Equilibria(potential=same, marks=marks, states=(in_body, closed)))
+
+    return jax.value_and_grad(of)(at)
+
+
+@jax.jit
+def _clamp_work(potential: Potential, marks: Landmarks, at: Sizes, y_stop: Array, y_q: Array) -> Sizes:
+    """Derivatives of the forces of contact times y, plus the residuals of q times y_q."""
+
+    def work(sizes: Sizes) -> Array:
+        same = potential.with_clamp_data(sizes.data)
+        touch = lambda x: energy(same.clamp, x, sizes.q)  # noqa: E731
+        states = (settled(same, at.x_body, sizes.q), settled(same, at.x_stop, sizes.q))
+        closing = stop_residual(sizes.stop, marks, same, states)
+        residuals = contact_forces(same, at.x_stop, sizes.q)[1].at[0].set(closing)
+        done: Array = jax.jvp(touch, (at.x_stop,), (y_stop,))[1]
+        return done + y_q @ residuals
+
+    return jax.grad(work)(at)
+
+
+@jax.jit
+def _by_clamp(d: Discretisation, scene: Scene, measured: Sizes, touch: Sizes) -> Scene:
+    """Derivatives by clamp, contact and stop from those by what they decide."""
+
+    def sizes(clamp: Any, contact: Any, stop: Any) -> tuple[Any, Stop]:
+        changed = dataclasses.replace(scene, clamp=clamp, contact=contact, stop=stop)
+        return potential_of(changed, d).clamp.data, stop
+
+    both = [(part.data, part.stop) for part in (measured, touch)]
+    by_what = jax.tree_util.tree_map(jnp.subtract, *both)
+    clamp, contact, stop = jax.vjp(sizes, scene.clamp, scene.contact, scene.stop)[1](by_what)
+    nothing: Scene = jax.tree_util.tree_map(jnp.zeros_like, scene)
+    return dataclasses.replace(nothing, clamp=clamp, contact=contact, stop=stop)

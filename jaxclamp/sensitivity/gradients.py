@@ -10,8 +10,11 @@ import numpy as np
 from jaxclamp.observe.measures import Measure
 from jaxclamp.scenes import address
 from jaxclamp.scenes.scene import Scene
-from jaxclamp.sensitivity.adjoint import value_and_gradient
+from jaxclamp.sensitivity.adjoint import value_and_clamp_gradient, value_and_gradient
 from jaxclamp.solve.results import Result
+
+OF_THE_CLAMP = ("clamp", "contact", "stop")
+"""parts of a scene that the artery in the body does not depend on"""
 
 
 def gradients(
@@ -35,7 +38,13 @@ def gradients(
     if isinstance(paths, str):
         raise TypeError(f"paths = {paths!r}: expected a list of addresses, such as [{paths!r}]")
     places = [address.describe(result.scene, path).path for path in paths or ()]
-    pairs = [value_and_gradient(result, measure) for measure in asked]
+    of_the_clamp = bool(places) and all(place.split(".")[0] in OF_THE_CLAMP for place in places)
+    pairs = [
+        (value_and_clamp_gradient if of_the_clamp and measure.needs_stop else value_and_gradient)(
+            result, measure
+        )
+        for measure in asked
+    ]
     values = np.array([value for value, _ in pairs], float)
     if paths is None:
         return values, tuple(gradient for _, gradient in pairs)

@@ -13,7 +13,7 @@ from jaxclamp.show.report import page
 from jaxclamp.solve.clamping import inflate
 from jaxclamp.trust.estimates import SOURCES, coarser, estimate, figures, multiplied, with_errors
 from jaxclamp.trust.price_list import REFERENCE_MESHES, richardson, scaled
-from tube import SEED, SEED_PRESSURE, SEED_STRETCH, Incompressible
+from tube import SEED, SEED_PRESSURE, SEED_STRETCH, Incompressible, random_sectors
 from walks import mesh, tube_scene
 
 FACTOR = 3.0
