@@ -25,8 +25,8 @@ from jaxclamp.solve.stages import Clamping
 from tube import MEDIA
 from walks import material
 
-EQUATIONS = {"wall: media": 2300, BLOOD: 260, JAWS: 430, INTIMA: 130, "sum": 130}
-"""of the programs that take the time, as JAX 0.10 traces them (see `test_the_programs...`), and a tenth"""
+EQUATIONS = {"wall: media": 2350, BLOOD: 215, JAWS: 305, INTIMA: 180, "sum": 145}
+"""of the programs that take the time, as JAX 0.10 traces them (2141, 195, 275, 164, 131), and a tenth"""
 
 
 def equations(jaxpr) -> int:
