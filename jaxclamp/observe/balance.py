@@ -22,15 +22,16 @@ def between_walls(potential: Potential, x: Array) -> Array:
 
     def at(planes: Array) -> Array:
         groups = potential.of(INTIMA)
+        inner = [next(term for term in g.terms if term.name == INTIMA) for g in groups]
         moved = [
-            dataclasses.replace(g.terms[0], here=dataclasses.replace(g.terms[0].here, plane=plane))
-            for g, plane in zip(groups, planes, strict=True)
+            dataclasses.replace(term, here=dataclasses.replace(term.here, plane=plane))
+            for term, plane in zip(inner, planes, strict=True)
         ]
         placed = [dataclasses.replace(g, terms=(term,)) for g, term in zip(groups, moved, strict=True)]
         return total(group_energy(group, x, jnp.zeros(0)) for group in placed)
 
     groups = potential.of(INTIMA)
-    sides = jnp.asarray([group.terms[0].here.side for group in groups], float)
+    sides = jnp.asarray([group.here(INTIMA).side for group in groups], float)
     return sides * jax.grad(at)(jnp.zeros(len(groups)))
 
 
@@ -59,11 +60,11 @@ def balance(e: Equilibria) -> Balance:
     Relative to the largest of them, or, where all vanish, to a thousandth of the wall's other forces.
     """
     x, q, free = e.last.x, e.last.q, e.potential.layout.free
-    pressure = e.potential.of(BLOOD)[0].terms[0].here.pressure
+    pressure = e.potential.of(BLOOD)[0].here(BLOOD).pressure
     stored, elastic = jax.value_and_grad(energy, argnums=1)(e.potential.at_pressure(0.0), x, q)
     volume, swelling = jax.value_and_grad(lumen_volume, argnums=1)(e.potential, x)
     jaws, inner = jaw_forces(e.potential, x, q), between_walls(e.potential, x)
-    up = jnp.asarray([float(group.terms[0].here.side) for group in e.potential.of(JAWS)])
+    up = jnp.asarray([float(group.here(JAWS).side) for group in e.potential.of(JAWS)])
     held = jnp.ones(x.size).at[free].set(0.0).reshape(x.shape)[:, 1]
     pushed = pressure * _lifting(e)
     supports = (elastic[:, 1] - pushed) * held
@@ -82,7 +83,7 @@ def balance(e: Equilibria) -> Balance:
 def _lifting(e: Equilibria) -> Array:
     """Vertical force of a unit pressure on each node, mm^2: int N n_y da, (n_nodes,)."""
     (group,) = e.potential.of(BLOOD)
-    x, weights = e.last.x, group.terms[0].here.weights
+    x, weights = e.last.x, group.here(BLOOD).weights
 
     def lifted(shift: Array) -> Array:
         y = group_points(group, x)

@@ -44,7 +44,7 @@ class Equilibria:
     @property
     def jaw(self) -> Jaw:
         """The jaw's shape."""
-        jaw: Jaw = self.potential.of(JAWS)[0].terms[0].here.jaw
+        jaw: Jaw = self.potential.of(JAWS)[0].here(JAWS).jaw
         return jaw
 
     def stresses(self, layer: int) -> Stresses:

@@ -111,7 +111,7 @@ def _area(e: Equilibria) -> Array:
 
 def _overlap(e: Equilibria) -> Array:
     """How far opposite inner walls are past the plane between them, both together, mm."""
-    heights = [group.terms[0].here.side * e.last.x[group.nodes, 1] for group in e.potential.of(INTIMA)]
+    heights = [group.here(INTIMA).side * e.last.x[group.nodes, 1] for group in e.potential.of(INTIMA)]
     return 2.0 * jnp.max(jnp.stack([jnp.max(-height) for height in heights]))
 
 
@@ -144,7 +144,7 @@ def _place_of_axial_peak(e: Equilibria, name: str) -> Array:
 
 def _stress_ratio(component: str) -> Read:
     def read(e: Equilibria) -> Array:
-        material = e.potential.layers[e.marks.P_layer].terms[0].here.material
+        material = e.potential.layers[e.marks.P_layer].solid.material
         noise = NOISE * jnp.max(material.c) + NOISE_OF_BULK * jnp.max(material.bulk)
         return ratio(stress_at_P(e, component), stress_at_P(e.in_body, component), noise)
 

@@ -172,7 +172,7 @@ MEASURES: tuple[Callable[..., Measure], ...] = (
 def smooth_peak(e: Equilibria, component: str, layer: str) -> Array:
     """Smooth maximum of a component of `Stresses` over the volume of a layer, kPa."""
     number = e.marks.layer(layer)
-    dV = e.potential.layers[number].terms[0].here.dV
+    dV = e.potential.layers[number].solid.dV
     return smooth_maximum(getattr(e.stresses(number), component), dV, PEAK_SHARPNESS)
 
 
@@ -237,7 +237,7 @@ def _smooth_peak_contact_pressure(e: Equilibria) -> Array:
 
 def _volume_above(e: Equilibria, layer: str, threshold: float) -> Array:
     number = e.marks.layer(layer)
-    dV = e.potential.layers[number].terms[0].here.dV
+    dV = e.potential.layers[number].solid.dV
     width = SMOOTHNESS_OF_THRESHOLD * abs(threshold) + 1e-9
     return jnp.sum(dV * sigmoid((e.stresses(number).axial - threshold) / width)) / jnp.sum(dV)
 

@@ -18,7 +18,7 @@ from jaxclamp.core.tensors import Tensor, cross, det, largest_eigenvalue, norm, 
 from jaxclamp.potential.densities import contact_pressure, deformation, jaw_gap
 from jaxclamp.potential.energy import State, at_points, gather, group_points
 from jaxclamp.potential.tangent import Piece, cut, piece
-from jaxclamp.potential.terms import Group, Potential
+from jaxclamp.potential.terms import JAWS, Group, Potential
 
 
 def cauchy_stress(cells: Piece) -> tuple[Tensor, Tensor]:
@@ -93,12 +93,12 @@ def layer_stresses(potential: Potential, state: State, layer: int) -> Stresses:
 def gaps(group: Group, state: State) -> Array:
     """Gap at the contact points of a group of jaw contact, mm, (n_q, n_facets)."""
     y = group_points(group, state.x)
-    return jaw_gap([y[0, i] for i in range(3)], state.q, group.terms[0].here)
+    return jaw_gap([y[0, i] for i in range(3)], state.q, group.here(JAWS))
 
 
 def facet_contact(group: Group, state: State) -> tuple[Array, Array]:
     """Contact pressure on the deformed outer wall, kPa, and current area of the points, mm^2."""
-    here = group.terms[0].here
+    here = group.here(JAWS)
     y = at_points(here.rule.dN, gather(state.x, group.nodes))
     first, second = ([y[c, i] for i in range(3)] for c in range(2))
     da = norm(cross(first, second)) * jnp.asarray(here.rule.weights)[:, None]
@@ -112,7 +112,7 @@ def touching(group: Group, state: State) -> tuple[Array, Array, Array]:
     where it presses less, smoothly.
     """
     pressure, da = facet_contact(group, state)
-    here = group.terms[0].here
+    here = group.here(JAWS)
     onset = here.contact.stiffness * here.contact.smoothing
     share = jnp.clip(pressure * da / here.dA / onset, 0.0, 1.0)
     return pressure, da, share**2 * (3.0 - 2.0 * share)

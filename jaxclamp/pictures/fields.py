@@ -91,7 +91,7 @@ def layer_fields(model: Model, state: State, start: State | None = None) -> tupl
         data["contact_pressure_kPa"] = touch[nodes]
         if start is not None:
             data["displacement_mm"] = x[nodes] - np.asarray(start.x)[nodes]
-        dV = np.asarray(group.terms[0].here.dV)
+        dV = np.asarray(group.solid.dV)
         J = np.sum(np.asarray(s.J) * dV, axis=0) / np.sum(dV, axis=0)
         layers.append(
             LayerFields(
@@ -130,7 +130,7 @@ def nodal_contact_pressure(model: Model, state: State) -> np.ndarray:
     for group in model.potential.of(JAWS):
         pressure, area = (np.asarray(v) for v in _facet_contact(group, state))
         nodes = np.asarray(group.nodes).ravel()
-        share = np.abs(np.asarray(group.terms[0].here.rule.N)).T
+        share = np.abs(np.asarray(group.here(JAWS).rule.N)).T
         force += np.bincount(nodes, (share @ (pressure * area)).ravel(), n)
         around += np.bincount(nodes, (share @ area).ravel(), n)
     return np.divide(force, around, out=np.zeros(n), where=around > 0.0)

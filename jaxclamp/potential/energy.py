@@ -80,7 +80,7 @@ def volumetric_energy(group: Group, y: Tensor) -> Array:
     """1/2 D' M^-1 D of the cells of a solid, uJ."""
     assert group.volume is not None
     assert group.modes is not None
-    D = dilatations(group.modes, group.terms[0].here, y)
+    D = dilatations(group.modes, group.solid, y)
     return 0.5 * jnp.sum(D * condensed_pressures(group.volume.stiffness, D))
 
 
@@ -92,7 +92,7 @@ def stored_energy(potential: Potential, x: Array) -> Array:
 def lumen_volume(potential: Potential, x: Array) -> Array:
     """Volume of the modelled part of the lumen, mm^3."""
     (group,) = potential.of(BLOOD)
-    return jnp.sum(swept_volume(group_points(group, x), group.terms[0].here.weights))
+    return jnp.sum(swept_volume(group_points(group, x), group.here(BLOOD).weights))
 
 
 def cell_pressures(potential: Potential, of_group: Callable[[Group], Array]) -> Array:
@@ -106,7 +106,7 @@ def settled(potential: Potential, x: Array, q: Array) -> State:
     def of(group: Group) -> Array:
         assert group.volume is not None
         assert group.modes is not None
-        D = dilatations(group.modes, group.terms[0].here, group_points(group, x))
+        D = dilatations(group.modes, group.solid, group_points(group, x))
         return condensed_pressures(group.volume.stiffness, D)
 
     return State(x=x, p=cell_pressures(potential, of), q=q)

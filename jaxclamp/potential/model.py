@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxclamp.core.programs import forget_if_crowded
 from jaxclamp.core.records import record, shape_of
 from jaxclamp.fem.grid import Mesh
 from jaxclamp.fem.landmarks import Landmarks, find_landmarks
@@ -90,6 +91,7 @@ class Model:
 
 def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
     """Mesh, sparse pattern and landmarks of a scene's static choices."""
+    forget_if_crowded()  # another mesh brings other programs
     mesh = build_tube(scene.mesh)
     stencils = build_stencils(mesh.element, scene.mesh.contact_points)
     sides = _sides(mesh, scene.mesh)

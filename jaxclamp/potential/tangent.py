@@ -338,7 +338,7 @@ def advance(potential: Potential, state: State, dx: Array, dq: Array, fraction: 
 
     def condensed(group: Group) -> Array:
         assert group.volume is not None
-        modes, solid = group.modes, group.terms[0].here
+        modes, solid = group.modes, group.solid
         assert modes is not None
         D = lambda x: dilatations(modes, solid, group_points(group, x))  # noqa: E731
         now, change = jax.jvp(D, (state.x,), (step,))

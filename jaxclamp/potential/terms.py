@@ -107,6 +107,15 @@ class Group:
         return any(term.moved for term in self.terms)
 
     @property
+    def solid(self) -> Any:
+        """What is known of the points of a layer of the wall, whose term comes first."""
+        return self.terms[0].here
+
+    def here(self, name: str) -> Any:
+        """What a term of the group knows of its points."""
+        return next(term.here for term in self.terms if term.name == name)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Of the terms."""
         names = tuple(term.name for term in self.terms)
@@ -132,9 +141,13 @@ class Potential:
         return tuple(group for group in self.groups if group.volume is not None)
 
     def keeping(self, wanted: Callable[[str], bool]) -> Potential:
-        """The potential with those groups alone whose terms are wanted, by name."""
-        kept = tuple(group for group in self.groups if any(wanted(term.name) for term in group.terms))
-        return dataclasses.replace(self, groups=kept)
+        """The potential with those terms alone that are wanted, by name."""
+
+        def kept(group: Group) -> Group:
+            return dataclasses.replace(group, terms=tuple(t for t in group.terms if wanted(t.name)))
+
+        groups = tuple(group for group in map(kept, self.groups) if group.terms)
+        return dataclasses.replace(self, groups=groups)
 
     @property
     def surfaces(self) -> Potential:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxclamp.core.failures import NotConverged
+from jaxclamp.core.programs import forget_if_crowded
 from jaxclamp.fem.grid import Mesh, build_block
 from jaxclamp.fem.pattern import Layout, Pattern, build_pattern, cut_into_blocks
 from jaxclamp.fem.stencils import build_stencils
@@ -83,6 +84,7 @@ def brick(
     function of the positions; materials: one for each layer, fibres in the y-z plane; constants may be
     arrays (n_q, n_cells of the layer); jaw: presses on the outer facets of the last layer, from above (+y)
     """
+    forget_if_crowded()
     mesh = build_block(element, layers, around, along)
     stencils = build_stencils(mesh.element, contact_points)
     X = positions(unit_places(mesh)) if callable(positions) else np.asarray(positions, float)

@@ -88,7 +88,7 @@ def test_the_supports_leave_no_rigid_motion(choice):
 @pytest.mark.parametrize("choice", CHOICES)
 def test_stress_free_volumes_add_up(choice):
     """Also where the ring wraps: the last cells end where the first begin."""
-    volume = lambda s: sum(float(g.terms[0].here.dV.sum()) for g in build_model(s).potential.layers)
+    volume = lambda s: sum(float(g.solid.dV.sum()) for g in build_model(s).potential.layers)
     parts = symmetry_of(choice).parts
     assert parts * volume(scene(choice)) == pytest.approx(8.0 * volume(scene("xyz")), rel=1e-12)
 

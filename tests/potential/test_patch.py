@@ -99,7 +99,7 @@ def test_patch(patch):
 def test_patch_volume_and_mass_of_pressure(patch):
     """Distortion does not change the volume, nor int N_m N_n / bulk dV of the constant mode."""
     (group,) = patch.block.potential.layers
-    dV = np.asarray(group.terms[0].here.dV)
+    dV = np.asarray(group.solid.dV)
     assert dV.sum() == pytest.approx(enclosed_volume(patch), rel=1e-12)
     compliance = np.linalg.inv(np.moveaxis(np.asarray(group.volume.stiffness), -1, 0))
     np.testing.assert_allclose(compliance[:, 0, 0], dV.sum(axis=0) / MATERIAL.bulk, rtol=1e-12)

@@ -94,7 +94,7 @@ def compare(model, state, exact: Compressible) -> Errors:
     squares = dict.fromkeys(("circumferential", "axial", "radial", "exact"), 0.0)
     for number, (first, last) in enumerate(model.mesh.layer_cells):
         profile = exact.profile(number, R[:, first:last].ravel())
-        weight = np.asarray(model.potential.layers[number].terms[0].here.dV).ravel()
+        weight = np.asarray(model.potential.layers[number].solid.dV).ravel()
         squares["exact"] += np.sum(weight * profile.hoop**2)
         for name, values in (
             ("circumferential", profile.hoop),
