@@ -87,7 +87,7 @@ def other_starts(problem: DesignProblem, count: int) -> list[np.ndarray]:
 def elsewhere(
     problem: DesignProblem, budget: Budget, count: int, folder: Path | None, resume: bool
 ) -> Iterator[list[Future[list[Evaluation]]]]:
-    """Studies from `count` other starts in processes of their own; ended with the block if it fails.
+    """Studies from `count` other starts in processes of their own; waited for if the block fails.
 
     folder: the journals are kept in its subfolders start-2, start-3 and so on; None: nowhere
     """

@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxclamp.show.description import warnings
 
 import jaxclamp as jc
+from jaxclamp.show.description import warnings
 from tube import Incompressible, Sector, extra_stress
 
 Point = Mapping[str, float]

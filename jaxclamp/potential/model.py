@@ -20,7 +20,6 @@ from jaxclamp.fem.tube import build_tube, end_height, end_lines, supports
 from jaxclamp.physics.contact import Contact
 from jaxclamp.potential.bodies import tube_body
 from jaxclamp.potential.terms import (
-    BLOOD,
     Made,
     Potential,
     Term,
@@ -82,11 +81,10 @@ class Model:
         """Distance of the artery's ends from mid-length at a stretch, mm."""
         return float(end_height(self.scene.artery, axial_stretch))
 
-    def solved(self, pressure: float, closing: bool) -> Potential:
-        """The terms that an equilibrium at a pressure needs, with or without the clamp."""
-        names = needed(self.scene, closing)
-        potential = self.potential.at_pressure(pressure)
-        return potential.keeping(lambda name: name in names and (pressure != 0.0 or name != BLOOD))
+    def solved(self, closing: bool, every_term: bool = False) -> Potential:
+        """The terms that an equilibrium needs, with or without the clamp; see `terms.needed`."""
+        names = needed(self.scene, closing, every_term)
+        return self.potential.keeping(lambda name: name in names)
 
 
 def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
@@ -157,6 +155,12 @@ def build_model(scene: Scene, like: Model | None = None) -> Model:
     # float64 arrays, as in derivatives: Python's floats would make JAX compile everything once more
     floats = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, jnp.float64), scene)
     return Model(scene, discretisation, pattern, potential_of(floats, discretisation))
+
+
+def bare(scene: Scene) -> Scene:
+    """The scene without title and solver: programs that take it are not compiled anew for those."""
+    plain = dataclasses.replace(scene.solver, tolerance=0.0, continuation="", linear_solver="")
+    return dataclasses.replace(scene, title="", solver=plain)
 
 
 def same_kind(a: Scene, b: Scene) -> bool:

@@ -324,10 +324,17 @@ OF_THE_CLAMP = tuple(kind.of_the_clamp for kind in KINDS if kind.of_the_clamp)
 """terms that are only there while the jaws close"""
 
 
-def needed(scene: Scene, closing: bool = True) -> dict[str, str]:
-    """Name of every term that a scene needs, and why; `closing`: with those of the clamp."""
+def needed(scene: Scene, closing: bool = True, every_term: bool = False) -> dict[str, str]:
+    """Name of every term that a scene needs, and why.
+
+    closing: with those of the clamp; every_term: leave nothing of the clamp out because of the stop
+    """
     kinds = [kind for kind in KINDS if closing or not kind.of_the_clamp]
-    return {name: reason for kind in kinds for name, reason in kind.reasons(scene).items()}
+    found = {name: reason for kind in kinds for name, reason in kind.reasons(scene).items()}
+    if closing and every_term:
+        unexpected = "needed on the way to the stop, although it seemed not to be"
+        found = {**dict.fromkeys(OF_THE_CLAMP, unexpected), **found}
+    return found
 
 
 def all_terms(made: Made) -> tuple[Term | Volume, ...]:

@@ -95,7 +95,7 @@ class Stop(abc.ABC):
 
 @record
 class MeshSettings:
-    """Hexahedra of the modelled eighth of the artery."""
+    """Hexahedra of the modelled part of the artery."""
 
     circumferential: int = static()
     """elements over the quarter circumference"""

@@ -26,7 +26,7 @@ from jaxclamp.fem.landmarks import Landmarks
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measures import Measure
 from jaxclamp.potential.energy import State, energy, settled
-from jaxclamp.potential.model import Discretisation, positions, potential_of
+from jaxclamp.potential.model import Discretisation, bare, positions, potential_of
 from jaxclamp.potential.tangent import Piece, cut, on_nodes, piece, piece_energy
 from jaxclamp.potential.terms import Potential
 from jaxclamp.scenes.scene import Scene, Stop
@@ -66,7 +66,7 @@ def value_and_gradient(result: Result, measure: Measure) -> tuple[float, Scene]:
     free = np.asarray(d.layout.free)
     assert result.physiological is not None
     base, last = result.physiological.state, result.states[-1].state
-    scene = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), result.scene)
+    scene = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), bare(result.scene))
     x_stop = last.x if to_stop else base.x
     at = Sizes(data=potential.data, stop=scene.stop, x_body=base.x, x_stop=x_stop, q=last.q)
     value, slopes = _measured(measure, potential, d.marks, at)
@@ -88,7 +88,7 @@ def value_and_gradient(result: Result, measure: Measure) -> tuple[float, Scene]:
         y_stop, y_q = on_nodes(d.layout, jnp.asarray(y.stop)), jnp.asarray(y.q)
         work.append(_wall_work(potential, last, y_stop))
     touch = _surface_work(potential, d.marks, at, y_body, y_stop, y_q)
-    return float(value), _by_scene(d, scene, slopes, touch, work)
+    return float(value), _named(_by_scene(d, scene, slopes, touch, work), result.scene)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -194,7 +194,7 @@ def value_and_clamp_gradient(result: Result, measure: Measure) -> tuple[float, S
     free = np.asarray(d.layout.free)
     last = result.states[-1].state
     assert result.physiological is not None
-    scene = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), result.scene)
+    scene = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), bare(result.scene))
     at = Sizes(
         data=potential.clamp.data,
         stop=scene.stop,
@@ -206,11 +206,17 @@ def value_and_clamp_gradient(result: Result, measure: Measure) -> tuple[float, S
     right: Any = np.asarray(slopes.x_stop).reshape(-1)[free]
     by_q: Any = np.asarray(slopes.q)
     if not np.any(right) and not np.any(by_q):  # a measure of the jaw alone
-        return float(value), _by_clamp(d, scene, slopes, jax.tree_util.tree_map(jnp.zeros_like, at))
+        nothing = jax.tree_util.tree_map(jnp.zeros_like, at)
+        return float(value), _named(_by_clamp(d, scene, slopes, nothing), result.scene)
     y = solve_linear(known, Unknowns(physiological=None, stop=right, q=by_q), transposed=True)
     y_stop = on_nodes(d.layout, jnp.asarray(y.stop))
     touch = _clamp_work(potential, d.marks, at, y_stop, jnp.asarray(y.q))
-    return float(value), _by_clamp(d, scene, slopes, touch)
+    return float(value), _named(_by_clamp(d, scene, slopes, touch), result.scene)
+
+
+def _named(gradient: Scene, scene: Scene) -> Scene:
+    """A gradient with the title and the solver of its scene."""
+    return dataclasses.replace(gradient, title=scene.title, solver=scene.solver)
 
 
 @partial(jax.jit, static_argnums=0)

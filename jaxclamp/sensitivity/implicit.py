@@ -34,7 +34,7 @@ from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measures import Measure
 from jaxclamp.potential.densities import RIGID
 from jaxclamp.potential.energy import State, energy, settled
-from jaxclamp.potential.model import Discretisation, discretise, positions, potential_of
+from jaxclamp.potential.model import Discretisation, bare, discretise, positions, potential_of
 from jaxclamp.potential.terms import Potential
 from jaxclamp.scenes.scene import Scene, Stop
 from jaxclamp.sensitivity.worker import call_elsewhere
@@ -326,6 +326,7 @@ def measured(measure: Measure, scene: Scene, d: Discretisation, u: Unknowns, tic
 
     Several programs rather than one: they compile faster, and measures share all but their own.
     """
+    scene = bare(scene)
     value: Array = _read(measure, see(scene, d, implicit(scene, d, u, ticket)))
     return value
 

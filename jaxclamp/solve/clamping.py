@@ -48,40 +48,44 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
     start = time.perf_counter()
     require_computable(scene)
     model = build_model(scene, None if guess is None else guess.model)
+    attempt, every_term = None, False
     if guess is not None:
-        result = _from_neighbour(model, guess, tell, to_stop, start)
+        result, attempt = _from_neighbour(model, guess, tell, to_stop, start)
         if result is not None:
             return result
+        every_term = guess.every_term
+    attempt = Clamping(model, tell, every_term=every_term, before=attempt)
     try:
-        return _from_nothing(model, tell, to_stop, start)
+        return _from_nothing(attempt, to_stop, start)
     except TermMissing:
-        return _from_nothing(model, tell, to_stop, start, every_term=True)
+        return _from_nothing(Clamping(model, tell, every_term=True, before=attempt), to_stop, start)
 
 
-def _from_neighbour(model: Model, guess: Result, tell: Tell, to_stop: bool, start: float) -> Result | None:
-    """The result from a neighbour's states; None where that leads nowhere."""
+def _from_neighbour(
+    model: Model, guess: Result, tell: Tell, to_stop: bool, start: float
+) -> tuple[Result | None, Clamping | None]:
+    """The result from a neighbour's states; None where that leads nowhere, with what was tried."""
     warm = on_mesh_of(model, guess)
     if warm is None:
-        return None
+        return None, None
     carried_over = warm is not guess
     keep = not carried_over and warm.scene.solver == model.scene.solver
     # the guess gives its solver away: it keeps the analysis of the pattern, and the last factors
     solver = warm.factors.take(np.asarray(warm.states[-1].equilibrium.lin.values)) if keep else None
-    clamping = Clamping(model, tell, solver)
+    clamping = Clamping(model, tell, solver, every_term=guess.every_term)
     try:
         if solve_warm(clamping, warm, to_stop, carried_over):
-            return _result(clamping, None, start)
+            return _result(clamping, None, start), clamping
     except TermMissing:
-        return None
+        pass
     except EquilibriumError as error:
         error.result = _result(clamping, error, start)
         raise
-    return None
+    return None, clamping
 
 
-def _from_nothing(model: Model, tell: Tell, to_stop: bool, start: float, every_term: bool = False) -> Result:
+def _from_nothing(clamping: Clamping, to_stop: bool, start: float) -> Result:
     """The result of the whole path."""
-    clamping = Clamping(model, tell, every_term=every_term)
     try:
         in_body = clamping.in_body(clamping.load_free())
         if to_stop:
@@ -131,4 +135,4 @@ def _result(clamping: Clamping, failure: EquilibriumError | None, start: float) 
     }
     settings = clamping.model.scene.solver
     factors = Factors(clamping.model.pattern, settings.linear_solver, system.solver)
-    return Result(clamping.model, states, failure, solver, cost, factors)
+    return Result(clamping.model, states, failure, solver, cost, factors, clamping.every_term)

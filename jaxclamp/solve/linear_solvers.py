@@ -280,9 +280,11 @@ class Factors:
         solver = self.take(values)
         if not solver.holds(values):
             solver.factor(values)
-        yield solver
-        with self._lock:
-            self._box = [*self._box, solver][-MOST_SOLVERS:]
+        try:
+            yield solver
+        finally:
+            with self._lock:
+                self._box = [*self._box, solver][-MOST_SOLVERS:]
 
     def solve(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
         """K^-1 b for a tangent and right-hand sides b (n, n_rhs). Raises Singular."""

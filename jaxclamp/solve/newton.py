@@ -111,8 +111,11 @@ class System:
     patience: int = MAX_LINEARISATIONS
     """linearisations after which it gives up"""
 
-    def be_patient(self) -> None:
-        """Allow as many assemblies from here as a clamping may need."""
+    def count_on(self, before: System) -> None:
+        """Go on counting where another system stopped, and allow as many assemblies from here."""
+        self.newton_iterations, self.load_steps = before.newton_iterations, before.load_steps
+        self.assembly_seconds, self.first_seconds = before.assembly_seconds, before.first_seconds
+        self.linearisations = before.linearisations
         self.patience = self.linearisations + MAX_LINEARISATIONS
 
     def linearise(self, state: State, pressure: float) -> Linearisation:
@@ -156,7 +159,9 @@ def converged(system: System, state: State, lin: Linearisation, off: float) -> b
     forces = lin.values[system.diagonal] * free
     sane = float(np.max(np.abs(forces), initial=0.0)) < LARGEST_FORCE
     rounding = ROUND_OFF * float(np.linalg.norm(forces)) if sane else 0.0
-    small = residual_norm(lin) <= max(system.tolerance * float(lin.reactions), rounding)
+    # rigid coordinates that nothing drives are in equilibrium, too
+    left = math.hypot(residual_norm(lin), float(np.linalg.norm(lin.rigid_force[1:])))
+    small = left <= max(system.tolerance * float(lin.reactions), rounding)
     closed = float(lin.volume_error) <= VOLUME_TOLERANCE and off <= CLOSING_TOLERANCE * system.length
     return small and closed
 
@@ -204,6 +209,8 @@ def newton(
     n_free = system.solver.n
     row = closing.row(state, n_free)
     if row.error != 0.0 and not np.any(row.by_x):  # a condition on the jaw alone is met at once
+        if row.by_q[0] == 0.0:
+            raise NotConverged("the jaw does not touch the artery")
         state = dataclasses.replace(state, q=moved(state.q, -row.error / row.by_q[0]))
     reuse = known if known is not None and known.state is state and known.pressure == pressure else None
     lin = system.linearise(state, pressure) if reuse is None else reuse.lin

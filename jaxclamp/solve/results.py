@@ -60,6 +60,8 @@ class Result:
     """times and memory, as in result.json"""
     factors: Factors = dataclasses.field(repr=False)
     """of its tangents, for derivatives"""
+    every_term: bool = False
+    """solved with terms that its stop seemed not to need"""
     errors: dict[str, dict[str, float | None]] | None = None
     """how far the main figures may be off, see `jaxclamp.trust.estimates`; None if it was not asked for"""
 
@@ -169,7 +171,7 @@ class Result:
                 "elements": self.model.mesh.n_cells,
                 "element": scene.mesh.element,
                 "unknowns": self.model.pattern.n,
-                "terms": needed(scene),
+                "terms": needed(scene, every_term=self.every_term),
                 "peak_sharpness": PEAK_SHARPNESS,
             },
             "solver": self.solver,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +22,7 @@ from jaxclamp.observe.stresses import Stresses, stresses
 from jaxclamp.potential.densities import RIGID
 from jaxclamp.potential.energy import State, with_equilibrium_pressure
 from jaxclamp.potential.model import Model
-from jaxclamp.potential.terms import INTIMA, needed
+from jaxclamp.potential.terms import INTIMA
 from jaxclamp.scenes.scene import Stop
 from jaxclamp.solve.descent import descend_eased, ease_of
 from jaxclamp.solve.follow import follow, stretched
@@ -43,6 +42,8 @@ NEARLY_THERE = 0.95
 """share of the way to the stop up to which closing goes in steps of travel, if it is to"""
 AT_THE_STOP = 1e-8
 """distance of the jaw from where the stop's condition holds, as part of the lumen radius"""
+ROUNDING = 1e-9
+"""overlap of opposite inner walls, as part of the lumen radius, that is none: nodes on the fold lie at 0"""
 LARGEST_SINKING = 0.5
 """jaw and wall, or opposite inner walls, may overlap by this part of the wall's thickness"""
 RESCUE_MOVE = 0.02
@@ -62,22 +63,28 @@ class Clamping:
     """One clamping under way: the system, what has converged so far, and whom to tell."""
 
     def __init__(
-        self, model: Model, tell: Tell, solver: LinearSolver | None = None, every_term: bool = False
+        self,
+        model: Model,
+        tell: Tell,
+        solver: LinearSolver | None = None,
+        every_term: bool = False,
+        before: Clamping | None = None,
     ) -> None:
-        self.model, self.tell, self.start = model, tell, time.perf_counter()
-        self.every_term = every_term
-        """do not leave out what the stop seems not to need"""
+        """solver: to factor with; every_term: leave nothing out because the stop seems not to need it;
+        before: an attempt at the same that came to nothing, whose work counts
+        """
+        self.model, self.tell, self.every_term = model, tell, every_term
         self.states: list[Kept] = []
         settings = model.scene.solver
-        solver = solver or LinearSolver(model.pattern, settings.linear_solver)
-        solver.reset_counts()
-        self.system = System(
-            potential=model.potential,
-            solver=solver,
-            tolerance=settings.tolerance,
-            length=1.0,
-            diagonal=model.pattern.diagonal,
-        )
+        if before is None:
+            solver = solver or LinearSolver(model.pattern, settings.linear_solver)
+            solver.reset_counts()
+        else:
+            solver = before.solver
+        self.solver: LinearSolver = solver
+        self.system = System(model.potential, solver, settings.tolerance, 1.0, model.pattern.diagonal)
+        if before is not None:
+            self.system.count_on(before.system)
 
     # --- what is kept -------------------------------------------------------------------------------
 
@@ -109,8 +116,9 @@ class Clamping:
         self.lumen_radius = 0.5 * float(lumen_height(body.x, marks))
         self.outer_radius = float(body.x[marks.outer_top, 1])
         self.system.length = self.lumen_radius
-        touching = dataclasses.replace(body, q=jnp.full(len(RIGID), self.outer_radius))
-        self.first_measure = self.measure(touching)
+        # smoothed contact presses before it touches
+        clear = self.outer_radius + 2.0 * float(self.model.scene.contact.smoothing)
+        self.first_measure = self.measure(dataclasses.replace(body, q=jnp.full(len(RIGID), clear)))
 
     def take_over(self, *kept: Kept) -> None:
         """Go on from states that are known already, the last of them in the body."""
@@ -124,14 +132,12 @@ class Clamping:
 
     def use_terms(self, closing: bool) -> None:
         """Have those terms that the stage needs."""
-        names = set(needed(self.model.scene, closing))
-        if closing and self.every_term:
-            names.add(INTIMA)
-        self.system.potential = self.model.potential.keeping(lambda name: name in names)
+        self.system.potential = self.model.solved(closing, self.every_term)
 
     def check(self, values: Record) -> None:
         """Refuse a closing state that the model does not cover. Raises EquilibriumError, TermMissing."""
-        if values["lumen_overlap_mm"] > 0.0 and not self.system.potential.of(INTIMA):
+        met = values["lumen_overlap_mm"] > ROUNDING * self.lumen_radius
+        if met and not self.system.potential.of(INTIMA):
             raise TermMissing(f"opposite inner walls meet before the stop: the term '{INTIMA}' is needed")
         reason, thickness = None, self.outer_radius - self.lumen_radius
         if values["outer_radius_mm"] - values["jaw_height_mm"] > LARGEST_SINKING * thickness:
@@ -227,8 +233,9 @@ class Clamping:
         if self.distance(now) <= AT_THE_STOP * self.lumen_radius:
             return None, never
         if scene.solver.continuation == "travel" and share < NEARLY_THERE:
-            jaw = float(now.state.jaw_height)
-            way = self.distance(now)
+            if not scene.stop.STEADY:
+                self.require_room(now)
+            jaw, way = float(now.state.jaw_height), min(self.distance(now), self.lumen_radius)
             there = lambda e: self.share(e.state) > NEARLY_THERE  # noqa: E731
             return (lambda s: self.step(Held(jaw - s * way))), there
         if scene.stop.STEADY or share > SEEN_COMING:

@@ -146,7 +146,7 @@ def predicted(result: Result, scene: Scene) -> Result:
     assert result.physiological is not None
     base, last = result.physiological.equilibrium, result.states[-1]
     model = build_model(scene, result.model)
-    clamping = Clamping(model, lambda event: None)
+    clamping = Clamping(model, lambda event: None, every_term=result.every_term)
     clamping.use_terms(closing=False)
     clamping.refer_to(base.state)
     near = _predicted(clamping, result, base, clamping.step(Held(float(base.state.jaw_height))))

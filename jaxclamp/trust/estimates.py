@@ -17,6 +17,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 
+import jax
 import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, Singular
@@ -100,6 +101,8 @@ def _total(parts: list[float | None]) -> float | None:
 
 def _from_the_mesh(result: Result, values: dict[str, float]) -> dict[str, float | None]:
     """Figure less the figure on an infinitely fine mesh; None where the twin has no equilibrium."""
+    if any(np.ndim(leaf) > 1 for leaf in jax.tree_util.tree_leaves(result.scene.artery)):
+        return dict.fromkeys(values)  # constants of each point belong to one mesh
     mesh, ratio = coarser(result.scene.mesh)
     scene = dataclasses.replace(result.scene, mesh=mesh)
     solve: Callable[..., Result] = clamp if result.states[-1].stage == "clamping" else inflate

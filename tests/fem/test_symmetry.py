@@ -57,6 +57,15 @@ def test_a_whole_model_starts_from_a_whole_one_only(eighth):
     assert again.solver["newton_iterations"] <= 1
 
 
+def test_rounding_at_the_fold_is_no_contact():
+    """Without the plane y = 0 nodes of the fold lie at +-1e-15: one walk, and errors are estimated."""
+    few = jc.with_errors(jc.clamp(jc.replace(scene("xz"), "stop.occlusion", 0.3)))
+    assert not few.every_term
+    like = jc.clamp(jc.replace(scene("auto"), "stop.occlusion", 0.3))
+    assert few.solver["newton_iterations"] < 1.5 * like.solver["newton_iterations"]
+    assert few.errors["clamp_force_N"]["error"] > 0.0
+
+
 @pytest.mark.parametrize("choice", CHOICES)
 def test_a_whole_mesh_is_the_mirrored_eighth(choice):
     """Nodes of the model with all its mirror images are those of the eighth with its own."""

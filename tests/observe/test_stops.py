@@ -90,6 +90,19 @@ def test_its_gradient_agrees_with_differences(clamped, path):
     assert min(errors) < 1e-6
 
 
+def test_the_least_force_is_reached():
+    """Less than what smoothed contact makes of a jaw that just touches."""
+    result = jc.clamp(jc.load_scene("human-lad", [*SMALL, "stop={force_N=1e-6}"]))
+    assert result.final["clamp_force_N"] == pytest.approx(1e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize("continuation", ["lumen", "travel"])
+def test_a_force_beyond_reach_is_named_whatever_the_continuation(continuation):
+    counts = [*SMALL, f"solver.continuation={continuation}", "stop={force_N=1000}"]
+    with pytest.raises(jc.EquilibriumError, match="N is all that force comes to at 99%"):
+        jc.clamp(jc.load_scene("human-lad", counts))
+
+
 def test_an_unknown_stop_is_refused_before_anything_is_solved():
     with pytest.raises(jc.SceneError, match=r"unknown key stop\.bone_mm"):
         jc.load_scene("human-lad", ["stop={bone_mm=3}"])

@@ -47,7 +47,7 @@ def small(*overrides: str) -> jc.Scene:
 def programs(scene: jc.Scene, closing: bool = True) -> dict[str, int]:
     """Size of the program of each term that the scene needs, and of the one that sums them up."""
     model = build_model(scene)
-    potential = model.solved(float(scene.artery.pressure), closing)
+    potential = model.solved(closing)
     x = closed_positions(model.mesh, scene.mesh, scene.artery)
     state = with_equilibrium_pressure(model.potential, x, jnp.asarray([10.0]))
     pieces = [cut(group, state) for group in potential.groups]
@@ -123,6 +123,14 @@ def test_inner_walls_that_meet_unexpectedly_bring_their_term_back(monkeypatch):
     found = jc.clamp(scene)
     for key in ("clamp_force_N", "lumen_contact_force_N", "lumen_width_mm"):
         assert found.final[key] == pytest.approx(expected.final[key], rel=1e-9), key
+    assert found.every_term
+    assert INTIMA in found.to_dict()["model"]["terms"]
+    assert jc.with_errors(found).errors["clamp_force_N"]["error"] is not None
+    # what was tried first counts, and a neighbour knows better
+    assert found.solver["newton_iterations"] > expected.solver["newton_iterations"]
+    warm = jc.clamp(jc.replace(scene, "clamp.jaw.radius", 3.02), guess=found)
+    assert warm.every_term
+    assert len(warm.states) == 3
 
 
 @pytest.mark.parametrize("pressure", [0.0, 13.33])

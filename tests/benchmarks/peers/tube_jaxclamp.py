@@ -68,7 +68,7 @@ def newton_alone(scene: Scene, u: np.ndarray, pressures: Sequence[float]) -> wor
     """Its Newton's method from the start displacement that the other codes have."""
     model = build_model(scene)
     system = System(
-        potential=model.solved(work.PRESSURE, closing=False),
+        potential=model.solved(closing=False),
         solver=LinearSolver(model.pattern, scene.solver.linear_solver),
         tolerance=scene.solver.tolerance,
         length=work.INNER_RADIUS,
