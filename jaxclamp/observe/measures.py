@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +51,15 @@ class Measure:
     def __str__(self) -> str:
         inside = ", ".join(map(str, self.arguments))
         return f"{self.name}({inside})"
+
+
+def require_measure(found: Any) -> Measure:
+    """The measure, or a TypeError that says what to write instead."""
+    if isinstance(found, Measure):
+        return found
+    name = getattr(found, "__name__", None)
+    said = f"the function {name}; call it, such as {name}()" if callable(found) and name else repr(found)
+    raise TypeError(f"expected a measure, found {said}")
 
 
 SMOOTHNESS_OF_THRESHOLD = 0.05

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxclamp.core.failures import BadKey
@@ -71,6 +72,16 @@ def check_signs(record: Any, path: str = "") -> None:
                 check_signs(part, where)
 
 
+def check_target(scene: Scene) -> None:
+    """The stop's target lies in its range: nothing is solved for one that does not."""
+    for key, field in schema.fields_by_key(type(scene.stop)).items():
+        interval = field.metadata["range"]
+        value = float(getattr(scene.stop, field.name)) / UNIT_FACTOR[interval.unit]
+        slack = 1e-9 * (abs(interval.lower) + abs(interval.upper))
+        if not interval.lower - slack <= value <= interval.upper + slack:
+            raise refuse(f"stop.{key}", value, str(interval))
+
+
 def _parts(value: Any, name: str) -> list[tuple[str, Any]]:
     """A value, or the items of a tuple, with their names."""
     if isinstance(value, tuple):
@@ -80,6 +91,8 @@ def _parts(value: Any, name: str) -> list[tuple[str, Any]]:
 
 def _check_sign(value: Any, interval: Range, name: str) -> None:
     """A number in internal units, or an array of them (any shape), is finite and positive if it has to be."""
+    if not isinstance(value, int | float | np.number | np.ndarray | jax.Array):
+        raise refuse(name, value if isinstance(value, str) else repr(value), str(interval))
     numbers = np.asarray(value, float)
     positive = interval.open_lower and interval.lower == 0.0
     wrong = ~np.isfinite(numbers) | (positive & ~(numbers > 0.0))

@@ -17,12 +17,13 @@ from typing import Any
 from jaxclamp.core.failures import BadKey, SceneError
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.scenes import schema
-from jaxclamp.scenes.checks import check, check_signs
+from jaxclamp.scenes.checks import check, check_mesh, check_signs, check_target
 from jaxclamp.scenes.fidelity import COUNTS, FIDELITIES, mesh_for
 from jaxclamp.scenes.overrides import apply_override
 from jaxclamp.scenes.presets import preset
 from jaxclamp.scenes.scene import Artery, Scene
 from jaxclamp.scenes.schema import refuse
+from jaxclamp.scenes.wording import shortened
 
 LARGEST_FILE = 1_000_000
 """bytes"""
@@ -74,13 +75,25 @@ def require_possible(scene: Scene) -> None:
         check(schema.read(Scene, schema.table(scene)))
 
 
-def require_computable(scene: Scene) -> None:
-    """Refuse a scene made in Python with a number that is not finite, or not positive where it has to be.
+def require_scene(found: Any) -> None:
+    """Raise TypeError for what is no scene."""
+    if not isinstance(found, Scene):
+        said = shortened(repr(found))
+        raise TypeError(f"expected a scene, such as jaxclamp.load_scene('human-lad'), found {said}")
 
-    Raises SceneError.
+
+def require_computable(scene: Scene) -> None:
+    """Refuse what cannot be solved: no scene, a number that is none, not finite, or not positive where it
+    has to be, a target out of its range, counts of elements that do not fit the layers.
+
+    Less than `require_possible`: differences may step over the ends of ranges. Raises TypeError for what is
+    no scene, SceneError for the rest.
     """
+    require_scene(scene)
     with _refusals("scene"):
         check_signs(scene)
+        check_target(scene)
+        check_mesh(scene)
 
 
 @contextmanager

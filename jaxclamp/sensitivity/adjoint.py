@@ -24,7 +24,7 @@ from jax import Array
 from jaxclamp.core.records import record
 from jaxclamp.fem.landmarks import Landmarks
 from jaxclamp.observe.equilibria import Equilibria
-from jaxclamp.observe.measures import Measure
+from jaxclamp.observe.measures import Measure, require_measure
 from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, positions, potential_of
 from jaxclamp.potential.tangent import Piece, cut, on_nodes, piece, piece_energy
@@ -59,7 +59,7 @@ def value_and_gradient(result: Result, measure: Measure) -> tuple[float, Scene]:
 
     Raises EquilibriumError if the stop was not reached, ValueError if it was not asked for.
     """
-    to_stop = measure.needs_stop
+    to_stop = require_measure(measure).needs_stop
     known = solution(result, to_stop)
     model = result.model
     d, potential = model.discretisation, model.potential

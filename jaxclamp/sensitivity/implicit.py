@@ -31,11 +31,12 @@ from jax.custom_derivatives import SymbolicZero
 
 from jaxclamp.core.records import record
 from jaxclamp.observe.equilibria import Equilibria
-from jaxclamp.observe.measures import Measure
+from jaxclamp.observe.measures import Measure, require_measure
 from jaxclamp.potential.densities import RIGID
 from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, discretise, positions, potential_of
 from jaxclamp.potential.terms import Potential
+from jaxclamp.scenes.files import require_scene
 from jaxclamp.scenes.scene import Scene, Stop
 from jaxclamp.sensitivity.worker import call_elsewhere
 from jaxclamp.solve.clamping import clamp, inflate
@@ -340,6 +341,8 @@ def evaluate(scene: Scene, measure: Measure, *, guess: Result | None = None) -> 
     Raises EquilibriumError if the scene has no converged state (under `jit`, JAX reports it as a
     JaxRuntimeError with the same sentence); there is no value and no derivative then.
     """
+    require_measure(measure)
+    require_scene(scene)
     fixed = lax.stop_gradient(jax.tree_util.tree_map(jnp.asarray, scene))
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree_util.tree_leaves(fixed)):
         d, _ = discretise(scene)

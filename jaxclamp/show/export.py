@@ -1,7 +1,7 @@
 """Everything a clamping leaves on disk, written whole or not at all.
 
-result.json, history.csv, clamping.pvd with paraview/*.vtu, figures/*.png and report.html. All
-files are made in a temporary folder inside the target and then renamed into place, so that a
+result.json, scene.toml (complete), history.csv, clamping.pvd with paraview/*.vtu, figures/*.png and
+report.html. All files are made in a temporary folder inside the target and then renamed into place, so that a
 full disk or an interruption leaves the target as it was.
 """
 
@@ -19,7 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxclamp.core.failures import SceneError
 from jaxclamp.core.progress import Progress
+from jaxclamp.scenes.files import dump_scene
 from jaxclamp.show.console import as_json
 from jaxclamp.show.paraview import FOLDER as STATES
 from jaxclamp.show.paraview import write_states
@@ -79,6 +81,10 @@ def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) 
     from jaxclamp.show.report import write_report
 
     yield write_report(result, folder / "report.html", plates)
+    scene = folder / "scene.toml"
+    with suppress(SceneError):  # constants of each point have no place in a file
+        scene.write_text(dump_scene(result.scene), encoding="utf-8")
+        yield scene
     final = folder / "result.json"
     final.write_text(as_json(plain(result.to_dict())) + "\n", encoding="utf-8")
     yield final

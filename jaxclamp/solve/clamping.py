@@ -6,9 +6,10 @@ import sys
 import time
 from collections.abc import Callable
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxclamp.core.failures import EquilibriumError, TermMissing
+from jaxclamp.core.failures import EquilibriumError, SceneError, TermMissing
 from jaxclamp.core.progress import Progress, Tell, teller
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.files import require_computable
@@ -47,6 +48,8 @@ def inflate(scene: Scene, *, guess: Result | None = None) -> Result:
 def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Result:
     start = time.perf_counter()
     require_computable(scene)
+    if to_stop:
+        require_a_gap(scene)
     model = build_model(scene, None if guess is None else guess.model)
     attempt, every_term = None, False
     if guess is not None:
@@ -59,6 +62,23 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
         return _from_nothing(attempt, to_stop, start)
     except TermMissing:
         return _from_nothing(Clamping(model, tell, every_term=True, before=attempt), to_stop, start)
+
+
+def require_a_gap(scene: Scene) -> None:
+    """Refuse a jaw whose gap is none: not finite, closed below its lowest point, or open inside it.
+
+    Raises SceneError.
+    """
+    far = 1e3 * float(scene.artery.layers[-1].inner_radius)
+    depth = 0.1 * float(scene.clamp.jaw.half_extent())
+    heights = np.array([-far, -depth, 0.0, depth])
+    points = (jnp.zeros(4), jnp.asarray(heights), jnp.zeros(4))
+    gap = np.asarray(scene.clamp.jaw.gap(points))
+    wanted = "a gap that is positive below the jaw's lowest point, 0 there and negative inside the jaw"
+    good = np.all(np.isfinite(gap)) and gap[0] > 0.0 and gap[1] > 0.0 and gap[3] < 0.0
+    if not good or abs(gap[2]) > 1e-6 * depth:
+        shown = ", ".join(f"{g:.3g} mm at y = {y:.3g} mm" for g, y in zip(gap, heights, strict=True))
+        raise SceneError(f"clamp.jaw of shape '{scene.clamp.jaw.shape}': expected {wanted}; it is {shown}")
 
 
 def _from_neighbour(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from jaxclamp.core.failures import EquilibriumError
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import FIGURES
-from jaxclamp.observe.measures import PEAK_SHARPNESS, Measure
+from jaxclamp.observe.measures import PEAK_SHARPNESS, Measure, require_measure
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
@@ -70,7 +70,7 @@ class Result:
 
         Raises EquilibriumError if the stop was not reached, ValueError if it was not asked for.
         """
-        self.require(measure.needs_stop)
+        self.require(require_measure(measure).needs_stop)
         return float(measure(self.equilibria))
 
     def require(self, to_stop: bool) -> None:

@@ -83,7 +83,7 @@ def test_every_file_is_there_and_nothing_else(result, folder):
         f"paraview/{part}_{i:03d}.vtu" for part in ("artery", "jaws") for i in range(len(result.states))
     }
     figures = {f"figures/{name}.png" for name in FIGURES}
-    expected = {"result.json", "history.csv", "report.html", "clamping.pvd"} | states | figures
+    expected = {"result.json", "scene.toml", "history.csv", "report.html", "clamping.pvd"} | states | figures
     assert {path.relative_to(folder).as_posix() for path in files_below(folder)} == expected
 
 

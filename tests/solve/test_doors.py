@@ -1,0 +1,153 @@
+"""Python's doors say in one sentence what is wrong, before anything is solved."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import pickle
+import threading
+from concurrent.futures import ProcessPoolExecutor
+
+import jax
+import numpy as np
+import pytest
+
+import jaxclamp as jc
+from jaxclamp.core import failures
+from jaxclamp.core.records import quantity, record, static
+from jaxclamp.physics.jaws import Jaw
+from jaxclamp.solve.clamping import inflate
+
+SMALL = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[1, 1]", "stop.occlusion=0.6"]
+
+
+def small(*overrides: str) -> jc.Scene:
+    return jc.load_scene("human-lad", [*SMALL, *overrides])
+
+
+@pytest.mark.parametrize("door", [jc.clamp, inflate, lambda s: jc.evaluate(s, jc.clamp_force())])
+def test_a_name_is_no_scene(door):
+    with pytest.raises(TypeError, match=r"expected a scene, such as jaxclamp\.load_scene"):
+        door("human-lad")
+
+
+def test_a_factory_is_no_measure():
+    result = jc.clamp(small())
+    calls = (
+        lambda: jc.evaluate(small(), jc.clamp_force),
+        lambda: jc.value_and_gradient(result, jc.clamp_force),
+        lambda: result.measure(jc.clamp_force),
+        lambda: jc.gradients(result, [jc.clamp_force]),
+    )
+    for call in calls:
+        with pytest.raises(TypeError, match=r"the function clamp_force; call it, such as clamp_force\(\)"):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("stop.occlusion", 92.5, r"stop\.occlusion = 92\.5: expected a number at least"),
+        ("clamp.jaw.radius", "3", r'clamp\.jaw\.radius_mm = "3": expected a number'),
+        ("clamp.jaw.radius", None, r"clamp\.jaw\.radius_mm"),
+        ("mesh.radial", (5,), r"mesh\.radial = \[5\]: expected one count for each of 2 layers"),
+        ("mesh.axial", 0, r"mesh\.axial = 0: expected a whole number from 2"),
+    ],
+)
+def test_what_cannot_be_solved_is_refused_at_once(path, value, said):
+    with pytest.raises(jc.SceneError, match=said):
+        jc.clamp(jc.replace(small(), path, value))
+
+
+@record
+class Upside(Jaw):
+    """A bar whose gap has the wrong sign."""
+
+    shape: str = static("upside down")
+    radius: jax.Array = quantity("mm", 0.0, 1e4)
+
+    def gap(self, point):
+        return self.radius - ((point[1] - self.radius) ** 2 + point[2] ** 2) ** 0.5
+
+    def half_extent(self):
+        return self.radius
+
+    def curvatures(self):
+        return np.ones(1)
+
+
+def test_a_jaw_turned_inside_out_is_named():
+    with pytest.raises(jc.SceneError, match=r"clamp\.jaw of shape 'upside down': expected a gap that is"):
+        jc.clamp(jc.replace(small(), "clamp.jaw", Upside(radius=3.0)))
+
+
+# --- case 4: ratios over rounding -------------------------------------------------------------------
+
+
+def test_a_ratio_over_rounding_is_null():
+    """A tube without opening angles, pressure and stretch has no stress in the body."""
+    scene = small("artery.pressure_kPa=0", "artery.axial_stretch=1.0", "stop={travel_mm=0.3}")
+    media, adventitia = scene.artery.layers
+    inner = dataclasses.replace(media, inner_radius=1.7, opening_angle=0.0)
+    outer = dataclasses.replace(adventitia, inner_radius=1.7 + media.thickness, opening_angle=0.0)
+    result = jc.clamp(jc.replace(scene, "artery.layers", (inner, outer)))
+    assert result.final["axial_stress_ratio_at_P"] is None
+    assert result.final["circumferential_stress_ratio_at_P"] is None
+    assert abs(result.final["axial_stress_at_P_kPa"]) > 0.1
+
+
+# --- cases 1 and 8: threads and processes -----------------------------------------------------------
+
+
+def flat(gradient: jc.Scene) -> np.ndarray:
+    return np.concatenate([np.ravel(np.asarray(a)) for a in jax.tree_util.tree_leaves(gradient)])
+
+
+def test_two_threads_differentiate_neighbouring_results():
+    """200 gradients each, of results of which one was the other's guess."""
+    first = jc.clamp(small())
+    results = (first, jc.clamp(jc.replace(small(), "clamp.jaw.radius", 2.9), guess=first))
+    measure = jc.smooth_peak_axial_stress("media")
+    expected = [flat(jc.value_and_gradient(result, measure)[1]) for result in results]
+    found: list[list[float]] = [[], []]
+
+    def work(which: int) -> None:
+        for _ in range(200):
+            gradient = flat(jc.value_and_gradient(results[which], measure)[1])
+            off = np.abs(gradient - expected[which]) / np.max(np.abs(expected[which]))
+            found[which].append(float(np.max(off)))
+
+    threads = [threading.Thread(target=work, args=(which,)) for which in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [len(f) for f in found] == [200, 200]
+    assert max(map(max, found)) < 1e-12
+
+
+def every_failure() -> list[failures.Failure]:
+    cause = failures.NotConverged("Newton's residual grows", 1.5, 0.2)
+    made = [failures.EquilibriumError("clamping", "beyond occlusion 50%", cause, "refine"), cause]
+    others = [cls for cls in vars(failures).values() if isinstance(cls, type)]
+    plain = [c for c in others if issubclass(c, failures.Failure) and c not in {type(m) for m in made}]
+    return made + [cls("one sentence") for cls in plain]
+
+
+@pytest.mark.parametrize("failure", every_failure(), ids=lambda f: type(f).__name__)
+def test_failures_pickle_with_their_sentence(failure):
+    again = pickle.loads(pickle.dumps(failure))
+    assert type(again) is type(failure)
+    assert str(again) == str(failure)
+    assert len(str(again)) > 5
+
+
+def fail() -> None:
+    raise every_failure()[0]
+
+
+def test_a_failure_comes_back_from_a_pool():
+    spawn = multiprocessing.get_context("spawn")
+    said = "beyond occlusion 50%: Newton's residual grows"
+    with ProcessPoolExecutor(1, mp_context=spawn) as pool, pytest.raises(jc.EquilibriumError, match=said):
+        pool.submit(fail).result(timeout=120)
