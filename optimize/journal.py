@@ -50,25 +50,35 @@ class Journal:
             self._lock.acquire(timeout=0)
         except Timeout:
             raise SceneError(f"{folder}: another study is writing there") from None
-        self.found = self._read()
-        if self.found and not resume:
-            self.close()
-            raise SceneError(
-                f"{folder} holds a study already: continue it with --resume, or take another folder"
-            )
-
-    def _read(self) -> dict[str, Any]:
-        """The study that is there; empty if there is none."""
-        path = self.folder / STUDY
-        if not path.exists():
-            return {}
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
+            self.found = self._read()
+            """the study that is there; None if there is none"""
+            if self.found is not None and not resume:
+                raise SceneError(
+                    f"{folder} holds a study already: continue it with --resume, or take another folder"
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def path(self) -> Path:
+        """The file study.json."""
+        return self.folder / STUDY
+
+    def _read(self) -> dict[str, Any] | None:
+        """The table that study.json holds; None if there is no such file."""
+        if not self.path.exists():
+            return None
+        try:
+            found = json.loads(self.path.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError):  # no JSON, digits in thousands, a list of lists of lists
             found = None
         if not isinstance(found, dict):
-            self.close()
-            raise SceneError(f"{path}: expected a study that this program has written")
+            raise SceneError(
+                f"{self.path}: expected a study that this program has written; "
+                "move the file away or take another folder"
+            )
         return found
 
     def write(self, content: dict[str, Any], rows: list[dict[str, Any]]) -> None:

@@ -9,13 +9,35 @@ from typing import Any
 
 import jaxclamp as jc
 from jaxclamp import Measure, SceneError
-from jaxclamp.scenes.wording import did_you_mean
+from jaxclamp.scenes.schema import shown
+from jaxclamp.scenes.wording import did_you_mean, shortened
+from optimize.numbers import MOST, number
 
 FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
 """internal unit -> unit in files, and internal units in one of it; the others are the same"""
 
 _EXAMPLE: dict[str, Any] = {"layer": "media", "stress": 1.0}
-_KINDS: dict[str, Any] = {"layer": (str, "the name of a layer"), "stress": ((int, float), "a stress in kPa")}
+
+
+def _layer(value: Any, path: str, layers: tuple[str, ...]) -> str:
+    """The name of one of the artery's layers. Raises SceneError."""
+    if value is None:
+        raise SceneError(f"{path} is missing: expected the name of a layer")
+    if not isinstance(value, str):
+        raise SceneError(f"{path} = {shown(value)}: expected the name of a layer")
+    if value not in layers:
+        raise SceneError(f"{path} = {shown(value)}: expected one of {', '.join(layers)}")
+    return value
+
+
+def _stress(value: Any, path: str, _layers: tuple[str, ...]) -> float:
+    """A stress in kPa. Raises SceneError."""
+    if value is None:
+        raise SceneError(f"{path} is missing: expected a stress in kPa")
+    return number(value, path, -MOST, MOST, "a stress in kPa")
+
+
+_READERS: dict[str, Callable[[Any, str, tuple[str, ...]], Any]] = {"layer": _layer, "stress": _stress}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,18 +82,11 @@ def read_measure(
         raise SceneError(f"{path}: expected a table with measure = one of {', '.join(known)}")
     key = table["measure"]
     if key not in known:
-        raise SceneError(f"{path}.measure = {key!r}: no such measure; {did_you_mean(key, list(known))}")
+        raise SceneError(f"{path}.measure = {shown(key)}: no such measure; {did_you_mean(key, list(known))}")
     chosen = known[key]
-    given = {}
-    for name in chosen.arguments:
-        kind, expected = _KINDS[name]
-        if not isinstance(table.get(name), kind) or isinstance(table.get(name), bool):
-            raise SceneError(f"{path}.{name} = {table.get(name)!r}: expected {expected}")
-        if name == "layer" and table[name] not in layers:
-            raise SceneError(f"{path}.layer = {table[name]!r}: expected one of {', '.join(layers)}")
-        given[name] = table[name]
+    given = {name: _READERS[name](table.get(name), f"{path}.{name}", layers) for name in chosen.arguments}
     allowed = ("measure", *chosen.arguments, *others)
     for name in table:
         if name not in allowed:
-            raise SceneError(f"unknown key {path}.{name}; {did_you_mean(name, list(allowed))}")
+            raise SceneError(f"unknown key {path}.{shortened(name)}; {did_you_mean(name, list(allowed))}")
     return chosen.factory(**given), chosen.factor

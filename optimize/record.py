@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp import SceneError, dump_scene, versions
+from jaxclamp import dump_scene, versions
 from optimize.problem import DesignProblem
 
 FEASIBLE = 1e-3
@@ -148,7 +148,7 @@ class Record:
         ]
 
     def _iterations(self) -> list[dict[str, Any]]:
-        """The rows of iterations.csv with what `read` needs to take them over."""
+        """The rows of iterations.csv with what `optimize.resuming` needs to take them over."""
         return [
             row
             | {
@@ -159,29 +159,8 @@ class Record:
             for row, e in zip(self.rows(), self.evaluations, strict=True)
         ]
 
-    def read(self, found: dict[str, Any]) -> None:
-        """Take over the evaluations of a study.json that were reached from the problem's own start.
-
-        Raises SceneError if it is of another study.
-        """
-        if found.get("fingerprint") != self.fingerprint:
-            raise SceneError("the study in that folder is another one: its scene, variables or method differ")
-        self.evaluations += [_evaluation(row) for row in found["iterations"] if row["start"] == 1]
-
 
 def _with_objective(final: dict[str, Any] | None, evaluation: Evaluation | None) -> dict[str, Any] | None:
     """A final record with the objective in front; None without a record."""
     value = None if evaluation is None or evaluation.failure else float(evaluation.values[0])
     return None if final is None else {"objective": value, **final}
-
-
-def _evaluation(row: dict[str, Any]) -> Evaluation:
-    """The evaluation that an item of "iterations" in study.json was written from."""
-    with_nan = lambda v: np.array(v, dtype=object).astype(float)  # noqa: E731  null is nan
-    return Evaluation(
-        design=np.array(row["design"], float),
-        values=with_nan(row["values"]),
-        gradients=with_nan(row["gradients"]),
-        newton_iterations=row["newton_iterations"],
-        failure=row["failure"] or None,
-    )

@@ -12,6 +12,7 @@ from jaxclamp.pictures.plots import Plate, png
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
 from optimize.figures import figures, shown
+from optimize.gains import Gain
 from optimize.journal import write_bytes, write_whole
 from optimize.record import FEASIBLE
 from optimize.study import Study
@@ -66,11 +67,11 @@ def page(study: Study, title: str, plates: list[tuple[Plate, bytes]]) -> str:
 def _opening(study: Study, title: str) -> str:
     value = lambda result: result.measure(study.problem.objective)  # noqa: E731
     unit, start, best = study.problem.objective.unit, value(study.start), value(study.best)
-    boxes = [(f"{1.0 - best / start:.1%}", "lower than the start")]
+    boxes = [Gain(start, best, unit).card("the start")]
     if study.reference is not None:
-        boxes.append((f"{1.0 - best / value(study.reference):.1%}", "lower than the reference"))
+        boxes.append(Gain(value(study.reference), best, unit).card("the reference"))
     boxes += [
-        (f"{best:.4g} {unit}", str(study.problem.objective)),
+        (f"{best:.4g} {unit}".rstrip(), str(study.problem.objective)),
         (str(len(study.evaluations)), "designs evaluated"),
     ]
     cards = "".join(f"<div><b>{escape(big)}</b>{escape(said)}</div>" for big, said in boxes)
@@ -119,8 +120,9 @@ def _verification(study: Study) -> str:
         for model, finals in models
     ]
     unit = study.problem.objective.unit
-    rows.append([f"objective, study's model ({unit})", *(number(found.coarse[name]) for name in results)])
-    rows.append([f"objective, finer ({unit})", *(number(found.fine[name]) for name in results)])
+    unit = f" ({unit})" if unit else ""
+    rows.append([f"objective, study's model{unit}", *(number(found.coarse[name]) for name in results)])
+    rows.append([f"objective, finer{unit}", *(number(found.fine[name]) for name in results)])
     sentence = found.sentence
     return f"<p>{escape(sentence[:1].upper() + sentence[1:])}.</p>" + table(["", *results], rows)
 

@@ -9,7 +9,7 @@ import dataclasses
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from optimize.evaluator import Evaluator
 from optimize.journal import Journal
 from optimize.problem import DesignProblem
 from optimize.record import Evaluation, Record
+from optimize.resuming import take_over
 
 MOST_DRAWS = 64
 """rounds of eight draws in which other starts that make sense are looked for"""
@@ -115,17 +116,17 @@ def from_another_start(
 ) -> list[Evaluation]:
     """The evaluations of a study of its own from the problem's scene; none if that has no equilibrium.
 
-    Raises OSError if its folder cannot be written.
+    Raises SceneError for a journal that is damaged or of another study, OSError if its folder cannot be
+    written.
     """
     record = Record(problem, budget.method, [])
     journal = None if folder is None else Journal(folder, resume)
     try:
-        if journal is not None and journal.found:
-            record.read(journal.found)
-        drive(record, budget, journal, lambda event: None)
-    except (EquilibriumError, SceneError):
+        take_over(record, journal, lambda event: None)
+        with suppress(EquilibriumError, SceneError):  # a start without equilibrium leaves nothing to keep
+            drive(record, budget, journal, lambda event: None)
+            return record.evaluations
         return []
     finally:
         if journal is not None:
             journal.close()
-    return record.evaluations

@@ -21,6 +21,7 @@ from optimize.drivers import METHODS
 from optimize.journal import Journal
 from optimize.problem import DesignProblem
 from optimize.record import Evaluation, Record
+from optimize.resuming import take_over
 from optimize.starts import Budget, drive, elsewhere
 from optimize.verification import Verification, verify
 
@@ -118,8 +119,7 @@ def minimise(
     budget = Budget(method, max_evaluations, tolerance)
     journal = None if place is None else Journal(place, resume)
     try:
-        if journal is not None and journal.found:
-            record.read(journal.found)
+        take_over(record, journal, tell)
         with elsewhere(problem, budget, starts - 1, place, resume) as others:
             first, stopped = drive(record, budget, journal, tell)
             if others:

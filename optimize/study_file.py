@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -13,12 +12,16 @@ from jaxclamp import Progress, Scene, SceneError, load_scene
 from jaxclamp.scenes.address import describe
 from jaxclamp.scenes.files import read_text
 from jaxclamp.scenes.schema import shown, toml_value
-from jaxclamp.scenes.wording import did_you_mean
+from jaxclamp.scenes.wording import did_you_mean, shortened
 from optimize.drivers import METHODS
 from optimize.named_measures import read_measure
+from optimize.numbers import MOST, number
 from optimize.problem import Constraint, DesignProblem
 from optimize.study import Study, minimise
 from optimize.variables import Variable
+
+LONGEST_NAME = 1000
+"""characters of the name of a scene or its file"""
 
 KEYS = (
     "title",
@@ -86,7 +89,7 @@ def load_study(name_or_path: str | Path) -> StudyFile:
 def _study(table: dict[str, Any], folder: Path) -> StudyFile:
     for key in table:
         if key not in KEYS:
-            raise SceneError(f"unknown key {key}; {did_you_mean(key, list(KEYS))}")
+            raise SceneError(f"unknown key {shortened(key)}; {did_you_mean(key, list(KEYS))}")
     reference, start = _scenes(table, folder)
     layers = tuple(layer.name for layer in start.artery.layers)
     objective, _ = read_measure(table.get("objective"), "objective", layers)
@@ -108,7 +111,7 @@ def _study(table: dict[str, Any], folder: Path) -> StudyFile:
         problem=problem,
         method=_choice(table, "method", "slsqp", tuple(METHODS)),
         max_evaluations=_whole(table, "max_evaluations", 40, 1, 10_000),
-        tolerance=_number(table.get("tolerance", 1e-4), "tolerance", 1e-12, 1.0),
+        tolerance=number(table.get("tolerance", 1e-4), "tolerance", 1e-12, 1.0),
         starts=_whole(table, "starts", 1, 1, 100),
     )
 
@@ -116,20 +119,33 @@ def _study(table: dict[str, Any], folder: Path) -> StudyFile:
 def _scenes(table: dict[str, Any], folder: Path) -> tuple[Scene, Scene]:
     """The scene as it is, and with the jaw to start from."""
     name = table.get("scene")
-    if not isinstance(name, str):
+    if not isinstance(name, str) or len(name) > LONGEST_NAME:
         raise SceneError(f"scene = {shown(name)}: expected a preset or a scene file")
     beside = folder / name
     scene: str | Path = beside if Path(name).suffix == ".toml" else name
     changes = table.get("set", [])
     if not isinstance(changes, list) or not all(isinstance(item, str) for item in changes):
         raise SceneError('set: expected a list of overrides, such as ["mesh.axial=30"]')
-    reference = load_scene(scene, changes)
+    reference = _loaded(scene, changes)
     if "start" not in table:
         return reference, reference
     start = table["start"]
     if not isinstance(start, dict) or set(start) != {"jaw"}:
         raise SceneError("start: expected a table with jaw = a jaw's name or table")
-    return reference, load_scene(scene, [*changes, f"clamp.jaw={toml_value(start['jaw'])}"])
+    try:
+        jaw = toml_value(start["jaw"])
+    except (ValueError, RecursionError):  # an integer of thousands of digits, a list of lists of lists
+        raise SceneError("start.jaw: expected numbers that a jaw can have, found one too long") from None
+    return reference, _loaded(scene, [*changes, f"clamp.jaw={jaw}"])
+
+
+def _loaded(scene: str | Path, changes: list[str]) -> Scene:
+    """The scene with its overrides. Raises SceneError, also for a name that no file can have."""
+    try:
+        return load_scene(scene, changes)
+    except OSError as error:
+        said = f"expected a preset or a scene file ({error.strerror})"
+        raise SceneError(f"scene = {shown(str(scene))}: {said}") from None
 
 
 def _tables(table: dict[str, Any], key: str) -> list[Any]:
@@ -144,14 +160,16 @@ def _variable(item: Any, scene: Scene, path: str) -> Variable:
         raise SceneError(f"{path}: expected a table with key, lower and upper")
     for name in item:
         if name not in ("key", "lower", "upper"):
-            raise SceneError(f"unknown key {path}.{name}; {did_you_mean(name, ['key', 'lower', 'upper'])}")
+            raise SceneError(
+                f"unknown key {path}.{shortened(name)}; {did_you_mean(name, ['key', 'lower', 'upper'])}"
+            )
     factor = describe(scene, item["key"]).factor
 
     def bound(side: str) -> tuple[float, ...] | None:
         if side not in item:
             return None
         given = item[side] if isinstance(item[side], list) else [item[side]]
-        return tuple(factor * _number(v, f"{path}.{side}", -math.inf, math.inf) for v in given)
+        return tuple(factor * number(v, f"{path}.{side}", -MOST, MOST) for v in given)
 
     return Variable(item["key"], bound("lower"), bound("upper"))
 
@@ -161,16 +179,8 @@ def _constraint(item: Any, layers: tuple[str, ...], path: str) -> Constraint:
     sides = {side: item[side] for side in ("lower", "upper") if side in item}
     if not sides:
         raise SceneError(f"{path}: expected lower, upper or both")
-    bounds = {side: factor * _number(value, f"{path}.{side}", -1e12, 1e12) for side, value in sides.items()}
+    bounds = {side: factor * number(value, f"{path}.{side}", -MOST, MOST) for side, value in sides.items()}
     return Constraint(measure, **bounds)
-
-
-def _number(value: Any, path: str, least: float, most: float) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not good or not least <= value <= most:
-        where = f" from {least:g} to {most:g}" if math.isfinite(least) else ""
-        raise SceneError(f"{path} = {shown(value)}: expected a number{where}")
-    return float(value)
 
 
 def _whole(table: dict[str, Any], key: str, default: int, least: int, most: int) -> int:

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from jaxclamp import EquilibriumError, Result, Scene, clamp, replace
+from optimize.gains import Gain
 from optimize.problem import DesignProblem
 
 STIFFER = 2.0
@@ -34,22 +35,27 @@ class Verification:
     """why start or best has no equilibrium there"""
     elements: int
     """of the finer mesh"""
+    unit: str = ""
+    """of the objective"""
 
     @property
-    def gain_before(self) -> float:
-        """Share by which the objective falls from start to best on the study's own model."""
-        return 1.0 - self.coarse["best"] / self.coarse["start"]
+    def gain_before(self) -> Gain:
+        """From start to best on the study's own model."""
+        return Gain(self.coarse["start"], self.coarse["best"], self.unit)
 
     @property
-    def gain(self) -> float | None:
+    def gain(self) -> Gain | None:
         """The same on the finer model; None if that is not known."""
         start, best = self.fine["start"], self.fine["best"]
-        return None if start is None or best is None else 1.0 - best / start
+        return None if start is None or best is None else Gain(start, best, self.unit)
 
     @property
     def survives(self) -> bool:
         """True if at least half of the gain is there on the finer model, or there was none to lose."""
-        return self.gain is not None and self.gain >= 0.5 * self.gain_before
+        if self.gain is None:
+            return False
+        before = self.gain_before.difference
+        return before <= 0.0 or self.gain.difference >= 0.5 * before
 
     @property
     def sentence(self) -> str:
@@ -57,8 +63,10 @@ class Verification:
         if self.gain is None:
             return f"the finer model has no equilibrium: {self.failure}"
         verdict = "the gain survives" if self.survives else "THE GAIN DOES NOT SURVIVE"
+        if self.gain_before.difference <= 0.0:
+            verdict = "there was no gain to lose"
         model = f"{self.elements} elements with harder contact"
-        return f"{verdict} on {model}: {self.gain:.1%} ({self.gain_before:.1%} before)"
+        return f"{verdict} on {model}: best against start is {self.gain}; before, it was {self.gain_before}"
 
     def to_dict(self) -> dict[str, Any]:
         """As in study.json."""
@@ -66,7 +74,13 @@ class Verification:
             name: None if final is None else {"objective": self.fine[name], **final}
             for name, final in self.final.items()
         }
-        said = {"gain": self.gain, "survives": self.survives, "elements": self.elements}
+        gain = self.gain
+        said = {
+            "gain": None if gain is None else gain.share,
+            "gain_difference": None if gain is None else gain.difference,
+            "survives": self.survives,
+            "elements": self.elements,
+        }
         return {**blocks, **said, "failure": self.failure}
 
 
@@ -84,4 +98,4 @@ def verify(problem: DesignProblem, results: dict[str, Result]) -> Verification:
         fine[name], final[name] = found.measure(problem.objective), found.final
         elements = found.model.mesh.n_cells
     coarse = {name: result.measure(problem.objective) for name, result in results.items()}
-    return Verification(coarse, fine, final, failure, elements)
+    return Verification(coarse, fine, final, failure, elements, problem.objective.unit)

@@ -364,6 +364,60 @@ def test_a_wrong_study_is_one_sentence_and_exit_code_2(tmp_path, capsys, old, ne
     assert not (tmp_path / "out" / "study.json").exists()
 
 
+VOLUME = '[[constraints]]\nmeasure = "volume_above"\nlayer = "media"\nstress = {}\nupper = 0.5\n'
+
+
+@pytest.mark.parametrize("number", ["9" * 400, "-" + "9" * 400, "0x" + "f" * 6000, "1e400", "inf", "nan"])
+@pytest.mark.parametrize(
+    ("old", "new", "key"),
+    [
+        ("max_evaluations = 12", "tolerance = {}", "tolerance = "),
+        ("max_evaluations = 12", "starts = {}", "starts = "),
+        ("lower = 0.0", "lower = {}", "variables[0].lower = "),
+        ("upper = 5.0", "upper = {}", "constraints[0].upper = "),
+        ('layer = "media"', "layer = {}", "objective.layer = "),
+        ("slopes = [1.2]", "slopes = [{}]", "jaw"),
+        ("[[constraints]]", VOLUME + "[[constraints]]", "constraints[0].stress = "),
+    ],
+)
+def test_numbers_that_no_float_can_hold_are_one_sentence(tmp_path, capsys, old, new, key, number):
+    path = written(tmp_path, STUDY.replace(old, new.format(number)))
+    assert main(["optimise", str(path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert key in said
+    assert "expected" in said
+    assert len(said) < 500
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('measure = "clamp_force_N"', 'measure = "{}"', "no such measure"),
+        ('layer = "media"', 'layer = "{}"', "expected one of media"),
+        ('scene = "human-lad"', 'scene = "{}"', "expected a preset or a scene file"),
+        ('scene = "human-lad"', 'scene = "{}.toml"', "expected a preset or a scene file"),
+        ("max_evaluations = 12", "{} = 12", "unknown key"),
+        ("lower = 0.0", "{} = 0.0", "unknown key variables[0]"),
+        ("upper = 5.0", "{} = 5.0", "unknown key constraints[0]"),
+    ],
+)
+def test_long_names_are_not_echoed_whole(tmp_path, old, new, said):
+    with pytest.raises(jc.SceneError) as refused:
+        load_study(written(tmp_path, STUDY.replace(old, new.format("x" * 100_000))))
+    assert said in str(refused.value)
+    assert len(str(refused.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    "key", ["artery.layers[999999999999].thickness_mm", "clamp.jaw.slopes[999999999999]"]
+)
+def test_a_position_far_beyond_a_list_is_one_sentence(tmp_path, key):
+    with pytest.raises(jc.SceneError, match="expected a position from") as refused:
+        load_study(written(tmp_path, STUDY.replace("clamp.jaw.slopes", key)))
+    assert "\n" not in str(refused.value)
+
+
 def test_every_named_measure_is_a_measure_of_a_result():
     problem, unit = one_slope(), {"mN": "N", "1/mm": "per_mm"}
     result = jc.clamp(problem.scene)
@@ -395,7 +449,11 @@ def test_the_command_line_does_a_study(tmp_path, capsys):
     assert study["best"]["objective"] < study["start"]["objective"]
     assert study["best"]["smooth_peak_axial_stress_kPa"]["media"] == pytest.approx(study["best"]["objective"])
     assert study["design"]["names"] == ["clamp.jaw.slopes[0]"]
-    assert set(study["verified_on_finer_mesh"]) >= {"reference", "start", "best"}
+    verified = study["verified_on_finer_mesh"]
+    assert set(verified) >= {"reference", "start", "best"}
+    fine = verified["start"]["objective"], verified["best"]["objective"]
+    assert verified["gain_difference"] == pytest.approx(fine[0] - fine[1])
+    assert verified["gain"] == pytest.approx(1.0 - fine[1] / fine[0])
     rows = (out / "iterations.csv").read_text().splitlines()
     assert len(rows) == study["evaluations"] + 1
     for name in ("report.html", "figures/profiles.png", "figures/stress.png", "start/report.html"):

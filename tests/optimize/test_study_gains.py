@@ -1,0 +1,66 @@
+"""Gains of objectives of any sign, and what is said of them."""
+
+from __future__ import annotations
+
+import pytest
+
+from optimize.gains import Gain
+from optimize.verification import Verification
+
+
+def verification(coarse, fine, unit="kPa"):
+    named = lambda pair: dict(zip(("start", "best"), pair, strict=True))
+    return Verification(named(coarse), named(fine), {}, None, 600, unit)
+
+
+@pytest.mark.parametrize(
+    ("coarse", "fine", "survives", "share"),
+    [
+        ((-5.0, -8.0), (-5.1, -4.0), False, -1.1 / 5.1),  # worse on the finer model
+        ((-5.0, -8.0), (-5.1, -7.0), True, 1.9 / 5.1),
+        ((0.0, -2.0), (0.0, -1.5), True, None),
+        ((0.0, -2.0), (0.0, 0.5), False, None),
+        ((100.0, 80.0), (110.0, 99.0), True, 0.1),
+        ((100.0, 80.0), (110.0, 101.0), False, 9.0 / 110.0),
+        ((1.0, -1.0), (0.5, -0.5), True, 2.0),  # through zero
+        ((100.0, 100.0), (110.0, 110.0), True, 0.0),
+        ((100.0, 101.0), (110.0, 111.0), True, -1.0 / 110.0),  # feasible at a price: nothing to lose
+    ],
+)
+def test_a_gain_survives_if_half_of_it_is_there(coarse, fine, survives, share):
+    found = verification(coarse, fine)
+    assert found.survives is survives
+    said = found.to_dict()
+    assert said["gain_difference"] == pytest.approx(fine[0] - fine[1])
+    assert said["gain"] == (None if share is None else pytest.approx(share))
+
+
+def test_the_sentence_reads_for_any_sign():
+    worse = verification((-5.0, -8.0), (-5.1, -4.0)).sentence
+    assert "DOES NOT SURVIVE" in worse
+    assert "1.1 kPa higher (21.6%); before, it was 3 kPa lower (60.0%)" in worse
+    zero = verification((0.0, -2.0), (0.0, -1.5), "").sentence
+    assert zero.endswith("best against start is 1.5 lower; before, it was 2 lower")
+    same = verification((4.0, 4.0), (4.2, 4.2)).sentence
+    assert "no gain to lose" in same
+    assert "the same" in same
+
+
+def test_a_finer_model_without_equilibrium_has_no_gain():
+    found = verification((4.0, 3.0), (None, 2.0))
+    said = found.to_dict()
+    assert (said["gain"], said["gain_difference"], said["survives"]) == (None, None, False)
+
+
+@pytest.mark.parametrize(
+    ("gain", "card"),
+    [
+        (Gain(-5.0, -8.0, "kPa"), ("3 kPa", "lower than the start (60.0%)")),
+        (Gain(-8.0, -5.0, "kPa"), ("3 kPa", "higher than the start (37.5%)")),
+        (Gain(0.0, -5.0, "kPa"), ("5 kPa", "lower than the start")),
+        (Gain(1e-300, -5.0, ""), ("5", "lower than the start (5e+300 times its size)")),
+        (Gain(0.0, 0.0, "mm"), ("unchanged", "against the start")),
+    ],
+)
+def test_the_opening_boxes_of_a_report(gain, card):
+    assert gain.card("the start") == card
