@@ -78,9 +78,10 @@ class Symmetry:
         along = "half the length" if "z" in self else "the whole length"
         names = {8: "one eighth", 4: "one quarter", 2: "one half"}
         planes = ", ".join(f"{axis} = 0" for axis in AXES if axis in self)
+        plane = "mirror planes" if len(self.planes) > 1 else "mirror plane"
         held = "" if "x" in self and "y" in self else "; its ends are held across where a plane is missing"
         return (
-            f"{names[self.parts]}: {around} by {along} (mirror planes {planes}), because both jaws are "
+            f"{names[self.parts]}: {around} by {along} ({plane} {planes}), because both jaws are "
             f"alike and the clamp sits in the middle{held}"
         )
 
