@@ -91,7 +91,7 @@ def _parts(value: Any, name: str) -> list[tuple[str, Any]]:
 
 def _check_sign(value: Any, interval: Range, name: str) -> None:
     """A number in internal units, or an array of them (any shape), is finite and positive if it has to be."""
-    if not isinstance(value, int | float | np.number | np.ndarray | jax.Array):
+    if not isinstance(value, int | float | list | tuple | np.number | np.ndarray | jax.Array):
         raise refuse(name, value if isinstance(value, str) else repr(value), str(interval))
     numbers = np.asarray(value, float)
     positive = interval.open_lower and interval.lower == 0.0

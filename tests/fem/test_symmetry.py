@@ -26,7 +26,13 @@ def eighth():
     return jc.clamp(scene("auto"))
 
 
-@pytest.mark.parametrize("choice", ["yz", "xz", "z", "none"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "choice",
+    ["yz", pytest.param("xz", marks=SLOW), pytest.param("z", marks=SLOW), pytest.param("none", marks=SLOW)],
+)
 def test_the_same_scene_in_lower_symmetry(eighth, choice):
     """Every figure and the derivatives, to solver tolerance; the supports across carry nothing."""
     result = jc.clamp(scene(choice))
@@ -49,6 +55,7 @@ def test_the_same_scene_in_lower_symmetry(eighth, choice):
         np.testing.assert_allclose(leaves[1], leaves[0], rtol=1e-6, atol=1e-9 * np.max(np.abs(leaves[0])))
 
 
+@pytest.mark.slow
 def test_a_whole_model_starts_from_a_whole_one_only(eighth):
     """Guesses of another symmetry are no neighbours; the answer is the same without."""
     warm = jc.clamp(scene("yz"), guess=eighth)

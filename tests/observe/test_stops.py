@@ -68,7 +68,14 @@ def test_it_is_written_and_read_as_any_other(clamped):
     assert float(again.stop.target()) == target
 
 
-@pytest.mark.parametrize("path", ["stop", "clamp.jaw.radius", "artery.pressure"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "stop",
+        pytest.param("clamp.jaw.radius", marks=pytest.mark.slow),
+        pytest.param("artery.pressure", marks=pytest.mark.slow),
+    ],
+)
 def test_its_gradient_agrees_with_differences(clamped, path):
     """Of the force, by the target itself, by the jaw and by a load: over a range of steps."""
     result, _, _ = clamped

@@ -392,7 +392,7 @@ class AreaStop(Stop):
 
 
 def test_a_stop_of_ones_own_needs_no_registration():
-    assert concrete_subclasses(Stop)[-1] is AreaStop
+    assert AreaStop in concrete_subclasses(Stop)
     scene = loads(scene_table(FLAT, {"area_mm2": 2}))
     assert isinstance(scene.stop, AreaStop)
     assert scene.stop == AreaStop(area=2.0)
@@ -405,12 +405,13 @@ def test_a_stop_of_ones_own_needs_no_registration():
         scene_table(FLAT, {"area_mm2": 0.0})
     )
     both = scene_table(FLAT, {"area_mm2": 1.0, "force_N": 1.0})
-    assert "expected exactly one of occlusion, travel_mm, force_N, area_mm2" in refusal(both)
+    assert "expected exactly one of occlusion, travel_mm, force_N, " in refusal(both)
 
 
 def test_an_unknown_stop_is_refused_with_those_there_are():
     sentence = refusal(scene_table(FLAT, {"zzz": 1.0}))
-    assert "unknown key stop.zzz; known here: occlusion, travel_mm, force_N, area_mm2" in sentence
+    assert "unknown key stop.zzz; known here: occlusion, travel_mm, force_N, " in sentence
+    assert "area_mm2" in sentence  # other tests have stops of their own
     assert "unknown key stop.kind" in refusal(scene_table(FLAT, {"kind": "area", "area_mm2": 1.0}))
 
 

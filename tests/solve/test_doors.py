@@ -103,8 +103,9 @@ def flat(gradient: jc.Scene) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(a)) for a in jax.tree_util.tree_leaves(gradient)])
 
 
-def test_two_threads_differentiate_neighbouring_results():
-    """200 gradients each, of results of which one was the other's guess."""
+@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
+def test_two_threads_differentiate_neighbouring_results(count):
+    """Of results of which one was the other's guess."""
     first = jc.clamp(small())
     results = (first, jc.clamp(jc.replace(small(), "clamp.jaw.radius", 2.9), guess=first))
     measure = jc.smooth_peak_axial_stress("media")
@@ -112,7 +113,7 @@ def test_two_threads_differentiate_neighbouring_results():
     found: list[list[float]] = [[], []]
 
     def work(which: int) -> None:
-        for _ in range(200):
+        for _ in range(count):
             gradient = flat(jc.value_and_gradient(results[which], measure)[1])
             off = np.abs(gradient - expected[which]) / np.max(np.abs(expected[which]))
             found[which].append(float(np.max(off)))
@@ -122,7 +123,7 @@ def test_two_threads_differentiate_neighbouring_results():
         thread.start()
     for thread in threads:
         thread.join()
-    assert [len(f) for f in found] == [200, 200]
+    assert [len(f) for f in found] == [count, count]
     assert max(map(max, found)) < 1e-12
 
 

@@ -112,7 +112,7 @@ def test_without_a_twin_the_error_is_not_known(clamped, monkeypatch):
     def refuse(scene, guess):
         raise jc.EquilibriumError("clamping", "somewhere", Failure("no"), "nothing")
 
-    monkeypatch.setattr("jaxclamp.errors.clamp", refuse)
+    monkeypatch.setattr("jaxclamp.trust.estimates.clamp", refuse)
     found = estimate(clamped)["clamp_force_N"]
     assert found["discretisation"] is None
     assert found["error"] is None
@@ -125,7 +125,7 @@ def test_a_prediction_that_is_refused_leaves_the_error_unknown(clamped, monkeypa
     def refuse(result, scene):
         raise jc.EquilibriumError("clamping", "somewhere", Failure("no"), "nothing")
 
-    monkeypatch.setattr("jaxclamp.errors.predicted", refuse)
+    monkeypatch.setattr("jaxclamp.trust.estimates.predicted", refuse)
     found = estimate(clamped)["clamp_force_N"]
     assert found["bulk"] is None
     assert found["error"] is None
