@@ -204,7 +204,8 @@ class Potential:
 
     def at_pressure(self, pressure: Array | float) -> Potential:
         """The potential with another blood pressure, kPa."""
-        return self.changed(BLOOD, lambda here: dataclasses.replace(here, pressure=jnp.asarray(pressure)))
+        known = jnp.asarray(pressure, float)  # never of weak type: programs would be compiled once more
+        return self.changed(BLOOD, lambda here: dataclasses.replace(here, pressure=known))
 
 
 # --- the kinds of terms ---------------------------------------------------------------------------

@@ -159,7 +159,7 @@ def _carried_along(block: Block, way: np.ndarray) -> np.ndarray:
 
 def at_rest(block: Block, x: np.ndarray, jaw_height: float = OPEN) -> State:
     """The state with nodes at x (n_nodes, 3) and pressures that fit."""
-    q = jnp.full(len(RIGID), jaw_height)
+    q = jnp.full(len(RIGID), jaw_height, float)
     return with_equilibrium_pressure(block.potential, jnp.asarray(x), q)
 
 

@@ -118,7 +118,7 @@ class Clamping:
         self.system.length = self.lumen_radius
         # smoothed contact presses before it touches
         clear = self.outer_radius + 2.0 * float(self.model.scene.contact.smoothing)
-        self.first_measure = self.measure(dataclasses.replace(body, q=jnp.full(len(RIGID), clear)))
+        self.first_measure = self.measure(dataclasses.replace(body, q=jnp.full(len(RIGID), clear, float)))
 
     def take_over(self, *kept: Kept) -> None:
         """Go on from states that are known already, the last of them in the body."""
@@ -158,7 +158,7 @@ class Clamping:
         self.use_terms(closing=False)
         x = closed_positions(model.mesh, scene.mesh, scene.artery) if guess is None else guess.x
         self.system.length = float(jnp.max(x[:, 1]))
-        far = jnp.full(len(RIGID), self.far)
+        far = jnp.full(len(RIGID), self.far, float)
         start = with_equilibrium_pressure(model.potential, x, far) if guess is None else guess
         equilibrium = self.solve_or_descend("load-free", start, Step(Held(self.far), 0.0, 1.0), "no load")
         self.system.length = 0.5 * float(lumen_height(equilibrium.state.x, model.marks))
@@ -218,7 +218,7 @@ class Clamping:
         move = FIRST_TOUCH * self.outer_radius
         while True:
             touch = self.outer_radius - move
-            start = dataclasses.replace(in_body.state, q=jnp.full(len(RIGID), touch))
+            start = dataclasses.replace(in_body.state, q=jnp.full(len(RIGID), touch, float))
             load = f"first contact, jaw height {touch:.3f} mm"
             equilibrium = self.solve_or_descend("clamping", start, self.step(Held(touch)), load)
             beyond = self.distance(equilibrium) if self.share(equilibrium.state) > 1.0 else 0.0
