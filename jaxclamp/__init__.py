@@ -9,6 +9,7 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxclamp.core.failures import EquilibriumError, SceneError  # noqa: E402
 from jaxclamp.core.progress import Progress  # noqa: E402
+from jaxclamp.observe.figures import shown_in  # noqa: E402
 from jaxclamp.observe.measures import (  # noqa: E402
     MEASURES,
     Measure,
@@ -72,6 +73,7 @@ __all__ = [
     "physiological_lumen_radius",
     "replace",
     "require_possible",
+    "shown_in",
     "smooth_peak_axial_stress",
     "smooth_peak_circumferential_stress",
     "smooth_peak_contact_pressure",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxclamp import Progress, dump_scene
+from jaxclamp import shown_in as figures_in
 from jaxclamp.pictures.plots import Plate, png
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
@@ -16,20 +17,6 @@ from optimize.gains import Gain
 from optimize.journal import write_bytes, write_whole
 from optimize.record import FEASIBLE
 from optimize.study import Study
-
-ROWS = (
-    ("peak_axial_stress_kPa", "peak axial stress"),
-    ("smooth_peak_axial_stress_kPa", "smooth peak axial stress"),
-    ("peak_circumferential_stress_kPa", "peak circumferential stress"),
-)
-NUMBERS = (
-    ("clamp_force_N", "force on one jaw"),
-    ("jaw_travel_mm", "travel of each jaw"),
-    ("max_contact_pressure_kPa", "highest contact pressure"),
-    ("lumen_width_mm", "lumen width"),
-    ("axial_stress_at_P_kPa", "axial stress at P"),
-    ("max_penetration_mm", "deepest point of the wall inside a jaw"),
-)
 
 
 def write_study(
@@ -95,11 +82,13 @@ def _comparison(study: Study) -> str:
     results = shown(study)
     layers = [layer.name for layer in study.best.scene.artery.layers]
     rows = [
-        [f"{label}, {layer} (kPa)", *(number(r.final[key][layer]) for r in results.values())]
-        for key, label in ROWS
+        [f"peak stress, {f.label}, {layer} (kPa)", *(number(r.final[f.key][layer]) for r in results.values())]
+        for f in figures_in("study peaks")
         for layer in layers
     ]
-    rows += [[label, *(number(r.final[key], key) for r in results.values())] for key, label in NUMBERS]
+    rows += [
+        [f.label, *(number(r.final[f.key], f.key) for r in results.values())] for f in figures_in("study")
+    ]
     return table(["at the stop", *results], rows)
 
 

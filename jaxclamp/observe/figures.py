@@ -65,7 +65,8 @@ class Figure:
     order: float | None = None
     """order of convergence for the estimate of its error; None: none is given"""
     shown: tuple[str, ...] = ()
-    """where it is listed: "summary" (console), "headlines", "numbers" and "peaks" (report), "study" """
+    """where it is listed: "summary" (console), "headlines", "numbers" and "peaks" (report), "study" and
+    "study peaks" (a study's page)"""
 
     @property
     def unit(self) -> str:
