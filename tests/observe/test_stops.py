@@ -71,8 +71,8 @@ def test_it_is_written_and_read_as_any_other(clamped):
 @pytest.mark.parametrize(
     "path",
     [
-        "stop",
-        pytest.param("clamp.jaw.radius", marks=pytest.mark.slow),
+        pytest.param("stop", marks=pytest.mark.slow),
+        "clamp.jaw.radius",
         pytest.param("artery.pressure", marks=pytest.mark.slow),
     ],
 )

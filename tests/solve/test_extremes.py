@@ -172,7 +172,14 @@ def errors_of_differences(result: jc.Result) -> dict[str, float]:
     return errors
 
 
-@pytest.mark.parametrize("name", ["nearly incompressible", "hard, sharp contact", "no blood, no stretch"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "nearly incompressible",
+        pytest.param("hard, sharp contact", marks=pytest.mark.slow),
+        "no blood, no stretch",
+    ],
+)
 def test_gradients_of_jaw_and_contact(name):
     result = jc.clamp(tight(solved(name).scene))
     errors = errors_of_differences(result)

@@ -118,7 +118,7 @@ def test_between_elements():
     np.testing.assert_allclose(again.states[-1].state.x, linear.states[-1].state.x, rtol=0.0, atol=1e-7)
 
 
-@pytest.mark.parametrize("stop", ["travel_mm=1.9", "force_N=0.2"])
+@pytest.mark.parametrize("stop", [pytest.param("travel_mm=1.9", marks=pytest.mark.slow), "force_N=0.2"])
 def test_at_other_stops(coarse, stop):
     def scene(axial):
         counts = ("mesh.circumferential=6", f"mesh.axial={axial}", "mesh.radial=[2, 2]")
