@@ -134,8 +134,12 @@ def _hash(self: Any) -> int:
 
 def concrete_subclasses(base: type) -> list[type]:
     """All records below an abstract base, in order of definition: the only registry there is."""
+    found: list[type] = []
     below: list[type] = base.__subclasses__()
-    return [cls for cls in below if dataclasses.is_dataclass(cls)]
+    for cls in below:
+        found += [cls] if "__dataclass_fields__" in vars(cls) else []
+        found += concrete_subclasses(cls)
+    return found
 
 
 def shape_of(tree: Any, describe: Callable[[Any], Any] = lambda leaf: getattr(leaf, "shape", ())) -> Any:

@@ -64,6 +64,11 @@ def squared_norm(A: Tensor) -> Array:
     return total(A[i, j] * A[i, j] for i in range(3) for j in range(3))
 
 
+def squared(a: Vector) -> Array:
+    """a . a of a vector by components."""
+    return total(component * component for component in a)
+
+
 def stacked(A: Tensor) -> Array:
     """A as one array (3, 3, *batch)."""
     return jnp.stack([jnp.stack([A[i, j] for j in range(3)]) for i in range(3)])
@@ -102,7 +107,7 @@ def safe_sqrt(s: Array) -> Array:
 
 def norm(a: Vector) -> Array:
     """Euclidean length of a (its components first), differentiable at 0 (derivative 0)."""
-    return safe_sqrt(total(component * component for component in a))
+    return safe_sqrt(squared(a))
 
 
 def ramp(u: Array, width: Array | float) -> Array:

@@ -35,7 +35,7 @@ class Mesh:
     """circumferential grid line of the cell's nodes, counted on where the block wraps, (n_en, n_cells)"""
     layer_cells: tuple[tuple[int, int], ...] = static()
     """first and last-plus-one cell of each layer"""
-    node_layer: np.ndarray
+    node_layer: tuple[int, ...] = static()
     """layer of each radial grid line (the inner one at interfaces), (n_r,)"""
     node_fraction: np.ndarray
     """position of each radial grid line through that layer, (n_r,)"""
@@ -120,7 +120,7 @@ def build_block(
         cell_fraction=np.concatenate(fractions, axis=1),
         cell_line=np.concatenate(lines, axis=1),
         layer_cells=tuple(layer_cells),
-        node_layer=np.array(node_layer),
+        node_layer=tuple(node_layer),
         node_fraction=np.array(node_fraction),
         inner_facets=facet(0),
         outer_facets=facet(grid[0] - 1),

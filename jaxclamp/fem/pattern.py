@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+import scipy.sparse as sp
 
 from jaxclamp.core.records import record, static
 
@@ -25,6 +26,9 @@ class Pattern:
     """place of each row's first entry, (n + 1,)"""
     indices: np.ndarray
     """column of each entry, (n_nonzeros,)"""
+    places: dict[str, sp.csr_matrix]
+    """by region: the entries of its matrices [a, b, pair, cell], block by block, summed into the tangent's
+    values; (n_nonzeros, number of entries), ones"""
 
     @property
     def n(self) -> int:
@@ -39,15 +43,12 @@ class Pattern:
 
 @record
 class Region:
-    """Some cells or facets: where terms live, and where their matrices go."""
+    """Some cells or facets: where terms live."""
 
     nodes: np.ndarray
     """of each cell or facet, (n_en, n_cells)"""
     blocks: tuple[tuple[int, int], ...] = static()
     """first and last-plus-one cell of what is differentiated together; all of one size"""
-    slots: tuple[np.ndarray, ...]
-    """by block: place of each entry of its matrices in the sparse values; the place behind the last one
-    takes what belongs nowhere"""
 
 
 @record
@@ -58,8 +59,6 @@ class Layout:
     """degree of freedom 3 node + component of each unknown, (n_free,)"""
     n_nodes: int = static()
     """nodes of all bodies"""
-    n_nonzeros: int = static()
-    """entries of the sparse tangent"""
 
 
 def cut_into_blocks(counts: tuple[int, ...], points_per_cell: int) -> int:
@@ -89,29 +88,30 @@ def build_pattern(
         for name, (nodes, size) in regions.items()
     }
     entries = {
-        (name, block): _keys(regions[name][0][:, slice(*block)], unknown, n)
-        for name in regions
-        for block in blocks[name]
+        name: np.concatenate([_keys(nodes[:, slice(*block)], unknown, n) for block in blocks[name]])
+        for name, (nodes, _) in regions.items()
     }
-    joined = np.concatenate(list(entries.values()))
-    distinct, place = np.unique(joined, return_inverse=True)
+    distinct, place = np.unique(np.concatenate(list(entries.values())), return_inverse=True)
     skipped = int(distinct[0] == -1)
-    n_nonzeros = len(distinct) - skipped
-    slots = np.where(joined < 0, n_nonzeros, place - skipped).astype(np.int32)
     ends = np.cumsum([keys.size for keys in entries.values()])[:-1]
-    by_block = dict(zip(entries, np.split(slots, ends), strict=True))
+    places = {
+        name: _places(own - skipped, len(distinct) - skipped)
+        for name, own in zip(entries, np.split(place.ravel(), ends), strict=True)
+    }
     rows, indices = np.divmod(distinct[skipped:], n)
     indptr = np.searchsorted(rows, np.arange(n + 1))
     found = {
-        name: Region(
-            nodes=nodes.astype(np.int32),
-            blocks=blocks[name],
-            slots=tuple(by_block[name, block] for block in blocks[name]),
-        )
+        name: Region(nodes=nodes.astype(np.int32), blocks=blocks[name])
         for name, (nodes, _) in regions.items()
     }
-    layout = Layout(free=free.astype(np.int32), n_nodes=len(held), n_nonzeros=n_nonzeros)
-    return layout, found, Pattern(indptr.astype(np.int32), indices.astype(np.int32))
+    layout = Layout(free=free.astype(np.int32), n_nodes=len(held))
+    return layout, found, Pattern(indptr.astype(np.int32), indices.astype(np.int32), places)
+
+
+def _places(place: np.ndarray, n_nonzeros: int) -> sp.csr_matrix:
+    """Ones where an entry of cell matrices goes in the tangent's values; -1 goes nowhere."""
+    (kept,) = np.nonzero(place >= 0)
+    return sp.csr_matrix((np.ones(len(kept)), (place[kept], kept)), shape=(n_nonzeros, len(place)))
 
 
 def _keys(nodes: np.ndarray, unknown: np.ndarray, n: int) -> np.ndarray:

@@ -11,6 +11,7 @@ a model of more than that is the same mesh, mirrored. Positions are functions of
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -135,7 +136,7 @@ def closed_radii(mesh: Mesh, artery: Artery) -> Array:
     inner_squared, squares = None, []
     for number, layer in enumerate(artery.layers):
         share = sector_share(layer.opening_angle)
-        R = layer.inner_radius + layer.thickness * mesh.node_fraction[mesh.node_layer == number]
+        R = layer.inner_radius + layer.thickness * mesh.node_fraction[np.asarray(mesh.node_layer) == number]
         if inner_squared is None:
             middle = layer.inner_radius + 0.5 * layer.thickness
             inner_squared = (middle * share) ** 2 - (middle**2 - layer.inner_radius**2) * share
@@ -144,6 +145,7 @@ def closed_radii(mesh: Mesh, artery: Artery) -> Array:
     return jnp.sqrt(jnp.concatenate(squares))
 
 
+@jax.jit
 def closed_positions(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """A guess of the load-free position of each node, mm, (n_nodes, 3)."""
     around = angles(mesh, settings)[: mesh.grid[1]]

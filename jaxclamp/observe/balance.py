@@ -39,7 +39,7 @@ def between_walls(potential: Potential, x: Array) -> Array:
 class Balance:
     """Energy, forces on the jaws, and the checks of equilibrium.
 
-    They come from the gradient of the potential, not from the assembled system that was solved.
+    They come from the gradient of the potential, term by term, not from the condensed system that was solved.
     """
 
     energy: Array
@@ -61,7 +61,10 @@ def balance(e: Equilibria) -> Balance:
     """
     x, q, free = e.last.x, e.last.q, e.potential.layout.free
     pressure = e.potential.of(BLOOD)[0].here(BLOOD).pressure
-    stored, elastic = jax.value_and_grad(energy, argnums=1)(e.potential.at_pressure(0.0), x, q)
+    stored, elastic = e.wall()
+    outside = e.potential.at_pressure(0.0).surfaces
+    of_surfaces, on_surfaces = jax.value_and_grad(energy, argnums=1)(outside, x, q)
+    stored, elastic = stored + of_surfaces, elastic + on_surfaces
     volume, swelling = jax.value_and_grad(lumen_volume, argnums=1)(e.potential, x)
     jaws, inner = jaw_forces(e.potential, x, q), between_walls(e.potential, x)
     up = jnp.asarray([float(group.here(JAWS).side) for group in e.potential.of(JAWS)])

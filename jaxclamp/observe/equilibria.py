@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
+
+import jax
+from jax import Array
 
 from jaxclamp.core.records import record
 from jaxclamp.fem.landmarks import Landmarks
 from jaxclamp.observe.stresses import Stresses, layer_stresses
 from jaxclamp.physics.jaws import Jaw
-from jaxclamp.potential.energy import State
+from jaxclamp.potential.energy import State, stored_energy
 from jaxclamp.potential.terms import JAWS, Potential
 
 
@@ -24,6 +28,9 @@ class Equilibria:
     """in the body, then closing; the last is the one asked about"""
     known_stresses: tuple[tuple[Stresses, ...], ...] | None = None
     """by state and layer, where they are at hand"""
+    known_wall: tuple[Any, Any] | None = None
+    """energy of the wall in the last state, uJ, and its derivative by the nodes, mN, (n_nodes, 3), where they
+    are at hand"""
 
     @property
     def body(self) -> State:
@@ -39,7 +46,7 @@ class Equilibria:
     def in_body(self) -> Equilibria:
         """The physiological state as the one asked about."""
         known = None if self.known_stresses is None else self.known_stresses[:1]
-        return dataclasses.replace(self, states=self.states[:1], known_stresses=known)
+        return dataclasses.replace(self, states=self.states[:1], known_stresses=known, known_wall=None)
 
     @property
     def jaw(self) -> Jaw:
@@ -52,3 +59,9 @@ class Equilibria:
         if self.known_stresses is not None:
             return self.known_stresses[-1][layer]
         return layer_stresses(self.potential, self.last, layer)
+
+    def wall(self) -> tuple[Array, Array]:
+        """Energy of the modelled wall in the last state, uJ, and its derivative by the nodes, mN."""
+        if self.known_wall is not None:
+            return self.known_wall
+        return jax.value_and_grad(stored_energy, argnums=1)(self.potential, self.last.x)

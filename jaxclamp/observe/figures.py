@@ -319,10 +319,6 @@ def _values(view: Callable[[Equilibria], Any], e: Equilibria) -> Record:
 
 
 _read = partial(jax.jit, static_argnums=0)(_values)
-# called once a state, it is compiled for a short compilation rather than for speed
-_read_balance = partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})(
-    _values
-)
 
 
 def read_figures(equilibria: Equilibria) -> Record:
@@ -333,7 +329,7 @@ def read_figures(equilibria: Equilibria) -> Record:
     views = dict.fromkeys(figure.view for figure in FIGURES)
     found: Record = {}
     for view in views:
-        found |= (_read_balance if view is balance else _read)(view, equilibria)
+        found |= _read(view, equilibria)
     found = jax.tree_util.tree_map(lambda leaf: np.asarray(leaf).tolist(), jax.device_get(found))
     names = equilibria.marks.layer_names
     in_order = lambda v: {n: _defined(v[n]) for n in names} if isinstance(v, dict) else _defined(v)  # noqa: E731

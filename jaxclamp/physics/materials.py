@@ -11,18 +11,20 @@ Equation numbers are those of Gasser, Schulze-Bauer & Holzapfel, J Biomech Eng 1
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 from jax import Array
 
 from jaxclamp.core.records import quantity, record, static
-from jaxclamp.core.tensors import Tensor, det, exponential_stiffening, squared_norm, total
+from jaxclamp.core.tensors import Tensor, Vector, det, exponential_stiffening, squared, squared_norm, total
 
 
 class Material(abc.ABC):
     """psi(F) = U(J) + psi_bar(F), the penalty form of Eq. (1).
 
-    A law is one record with `c` (its shear modulus), `bulk`, its other constants, and `psi_bar`.
+    A law is one record with `c` (its shear modulus), `bulk`, its other constants, and `psi_bar` - or, below
+    `FibreLaw`, `psi_of` of its invariants, which is faster.
     Elements evaluate psi_bar at the points and U with the dilatation averaged over the cell.
     """
 
@@ -46,29 +48,48 @@ class Material(abc.ABC):
         return self.U(det(F)) + self.psi_bar(F)
 
 
-def _isochoric_scale(F: Tensor) -> tuple[Array, Array]:
-    """det F > 0, and (det F)**(-2/3) (1 where the determinant is not positive)."""
-    J = det(F)
-    inside = J > 0.0
-    return inside, jnp.where(inside, J, 1.0) ** (-2.0 / 3.0)
+class FibreLaw(Material):
+    """A law of I1, J and the I4 of fibre families: psi_bar is a function of these few numbers.
+
+    Its tangent costs a fraction of what a law of all nine components of F does: the engine knows the
+    derivatives of the invariants in closed form (`potential.wall`), and asks the law for those by these few.
+    """
+
+    @abc.abstractmethod
+    def directions(self) -> tuple[Vector, ...]:
+        """Unit vector of each fibre family along the material axes (radial, circumferential, axial)."""
+
+    @abc.abstractmethod
+    def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        """psi_bar, kPa, of I1 = F : F, J = det F > 0, and I4 = |F a|**2 of each family."""
+
+    def psi_bar(self, F: Tensor) -> Array:
+        """psi_of the invariants of F; +inf where det F <= 0."""
+        return self.psi_of_invariants(squared_norm(F), det(F), [squared(v) for v in self.fibres(F)])
+
+    def fibres(self, F: Tensor) -> list[Vector]:
+        """F a of each family."""
+        return [[total(a[k] * F[i, k] for k in range(3)) for i in range(3)] for a in self.directions()]
+
+    def psi_of_invariants(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        """psi_of, and +inf where J <= 0."""
+        inside = J > 0.0
+        return jnp.where(inside, self.psi_of(I1, jnp.where(inside, J, 1.0), I4), jnp.inf)
 
 
-def _matrix(c: Array, F: Tensor, scale: Array) -> Array:
+def _matrix(c: Array, I1_bar: Array) -> Array:
     """c/2 (I1_bar - 3), the ground substance; c is the shear modulus."""
-    return c / 2.0 * (scale * squared_norm(F) - 3.0)
+    return c / 2.0 * (I1_bar - 3.0)
 
 
-def _stretch_squared(F: Tensor, angle: Array) -> tuple[Array, Array]:
-    """I4 = |F a0|**2 of the two families a0 = (0, cos b, +-sin b), Eq. (6)."""
-    hoop = [jnp.cos(angle) * F[i, 1] for i in range(3)]
-    axial = [jnp.sin(angle) * F[i, 2] for i in range(3)]
-    plus = total((h + a) ** 2 for h, a in zip(hoop, axial, strict=True))
-    minus = total((h - a) ** 2 for h, a in zip(hoop, axial, strict=True))
-    return plus, minus
+def _two_families(angle: Array) -> tuple[Vector, Vector]:
+    """a0 = (0, cos b, +-sin b), Eq. (6)."""
+    nothing, hoop, axial = jnp.zeros_like(angle), jnp.cos(angle), jnp.sin(angle)
+    return (nothing, hoop, axial), (nothing, hoop, -axial)
 
 
 @record
-class NeoHookean(Material):
+class NeoHookean(FibreLaw):
     """Isotropic ground substance only: c/2 (I1_bar - 3)."""
 
     law: str = static("neo-hookean")
@@ -77,13 +98,15 @@ class NeoHookean(Material):
     bulk: Array = quantity("kPa", 1e-3, 1e12)
     """bulk modulus, the penalty on the change of volume"""
 
-    def psi_bar(self, F: Tensor) -> Array:
-        inside, scale = _isochoric_scale(F)
-        return jnp.where(inside, _matrix(self.c, F, scale), jnp.inf)
+    def directions(self) -> tuple[Vector, ...]:
+        return ()
+
+    def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        return _matrix(self.c, J ** (-2.0 / 3.0) * I1)
 
 
 @record
-class HGO(Material):
+class HGO(FibreLaw):
     """Two families of collagen fibres in a neo-Hookean matrix, Eq. (4).
 
     `fibre_energy = "eq4"` is the energy as printed; its fibre stress is k1 E exp(k2 E**2).
@@ -107,21 +130,24 @@ class HGO(Material):
     fibre_energy: str = static("eq4", choices=("eq4", "eq10"))
     fibre_invariant: str = static("isochoric", choices=("isochoric", "full"))
 
-    def psi_bar(self, F: Tensor) -> Array:
-        inside, scale = _isochoric_scale(F)
+    def directions(self) -> tuple[Vector, ...]:
+        return _two_families(self.fibre_angle)
+
+    def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        scale = J ** (-2.0 / 3.0)
         fibre_scale = scale if self.fibre_invariant == "isochoric" else 1.0
-        energy = _matrix(self.c, F, scale)
-        for I4 in _stretch_squared(F, self.fibre_angle):
-            E = jnp.maximum(fibre_scale * I4 - 1.0, 0.0)  # fibres carry tension only
+        energy = _matrix(self.c, scale * I1)
+        for stretch_squared in I4:
+            E = jnp.maximum(fibre_scale * stretch_squared - 1.0, 0.0)  # fibres carry tension only
             fibre = exponential_stiffening(self.k2, E)
             if self.fibre_energy == "eq10":
                 fibre = fibre - E * E / 2.0
             energy = energy + self.k1 * fibre
-        return jnp.where(inside, energy, jnp.inf)
+        return energy
 
 
 @record
-class GOH(Material):
+class GOH(FibreLaw):
     """Dispersed fibres: E = d (I1_bar - 3) + (1 - 3 d) (I4_bar - 1), tension only (E > 0).
 
     Gasser, Ogden & Holzapfel, J R Soc Interface 3 (2006) 15. Dispersion 0 gives the HGO law
@@ -142,11 +168,14 @@ class GOH(Material):
     bulk: Array = quantity("kPa", 1e-3, 1e12)
     """bulk modulus, the penalty on the change of volume"""
 
-    def psi_bar(self, F: Tensor) -> Array:
-        inside, scale = _isochoric_scale(F)
-        energy = _matrix(self.c, F, scale)
-        I1_part = self.dispersion * (scale * squared_norm(F) - 3.0)
-        for I4 in _stretch_squared(F, self.fibre_angle):
-            E = I1_part + (1.0 - 3.0 * self.dispersion) * (scale * I4 - 1.0)
+    def directions(self) -> tuple[Vector, ...]:
+        return _two_families(self.fibre_angle)
+
+    def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        scale = J ** (-2.0 / 3.0)
+        energy = _matrix(self.c, scale * I1)
+        I1_part = self.dispersion * (scale * I1 - 3.0)
+        for stretch_squared in I4:
+            E = I1_part + (1.0 - 3.0 * self.dispersion) * (scale * stretch_squared - 1.0)
             energy = energy + self.k1 * exponential_stiffening(self.k2, jnp.maximum(E, 0.0))
-        return jnp.where(inside, energy, jnp.inf)
+        return energy

@@ -46,7 +46,7 @@ def at_points(stencil: AnyArray, x: Array) -> dict[tuple[int, int], Array]:
 
 def gather(x: Array, nodes: AnyArray) -> Array:
     """Positions of the nodes of some cells, (n_en, 3, n_cells)."""
-    return jnp.swapaxes(x[nodes], 1, 2)
+    return x[nodes].swapaxes(1, 2)
 
 
 def group_points(group: Group, x: Array) -> dict[tuple[int, int], Array]:
@@ -112,4 +112,10 @@ def settled(potential: Potential, x: Array, q: Array) -> State:
     return State(x=x, p=cell_pressures(potential, of), q=q)
 
 
-with_equilibrium_pressure = jax.jit(settled)
+_settled = jax.jit(settled)
+
+
+def with_equilibrium_pressure(potential: Potential, x: Array, q: Array) -> State:
+    """`settled`, compiled once for the wall alone."""
+    found: State = _settled(potential.wall, x, q)
+    return found

@@ -9,16 +9,18 @@ zz, xy, xz, yz) over all pairs of nodes. One program serves every piece of one k
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxclamp.core.records import record, static
 from jaxclamp.core.tensors import Tensor, det, pointwise_derivatives, stacked, total
-from jaxclamp.fem.pattern import PAIRS, Layout
-from jaxclamp.potential.densities import RIGID, Density, Solid, dilatation, mixed_energy
+from jaxclamp.fem.pattern import PAIRS, Layout, Pattern
+from jaxclamp.potential.densities import RIGID, Density, Solid, dilatation
 from jaxclamp.potential.energy import (
     AnyArray,
     State,
@@ -30,6 +32,7 @@ from jaxclamp.potential.energy import (
     group_points,
 )
 from jaxclamp.potential.terms import Group, Potential
+from jaxclamp.potential.wall import by_pairs, wall_derivatives
 
 
 def to_nodes(stencil: AnyArray, dy: Array) -> Array:
@@ -42,12 +45,12 @@ def to_nodes(stencil: AnyArray, dy: Array) -> Array:
 def to_matrices(stencil: AnyArray, moduli: Array) -> Array:
     """Cell matrices from second derivatives at the points.
 
-    moduli: d2/dy_ci dy_dj for the six PAIRS (i, j), (n_c, n_c, 6, n_q, n_cells)
+    moduli: d2/dy_ci dy_dj for the six PAIRS (i, j), (n_c, n_c, n_q, 6, n_cells)
     Returns K[a, i, b, j]: (n_en, n_en, 6, n_cells).
     """
     n_en = stencil.shape[2]
-    products = jnp.einsum("qca,qdb->abqcd", stencil, stencil).reshape(n_en**2, -1)
-    return (products @ jnp.moveaxis(moduli, 3, 0).reshape(products.shape[1], -1)).reshape(n_en, n_en, 6, -1)
+    products = jnp.einsum("qca,qdb->abcdq", stencil, stencil).reshape(n_en**2, -1)
+    return (products @ moduli.reshape(products.shape[1], -1)).reshape(n_en, n_en, 6, -1)
 
 
 @record
@@ -106,49 +109,53 @@ class Linearised:
     """d2 Pi/dq2, mN/mm, (n_q, n_q)"""
 
 
-@record
+@dataclasses.dataclass(frozen=True)
 class Linearisation:
-    """Potential, forces and condensed tangent at a state."""
+    """Potential, forces and condensed tangent at a state, on the host."""
 
-    energy: Array
+    energy: float
     """potential with the pressures at their best, uJ"""
-    residual: Array
+    wall_energy: float
+    """of the wall alone, uJ"""
+    wall_force: np.ndarray
+    """its derivative by the nodes, mN, (n_nodes, 3)"""
+    residual: np.ndarray
     """d Pi/dx of the free degrees of freedom, pressures condensed, mN, (n_free,)"""
-    imbalance: Array
+    imbalance: float
     """norm of the free forces at the *stored* pressures, mN: what a trial state is judged by, because
     a step changes the stored pressures to first order only"""
-    reactions: Array
+    reactions: float
     """norm of the forces on the supports, mN"""
-    volume_error: Array
+    volume_error: float
     """largest |mean J - 1 - p / bulk| of a cell"""
-    values: Array
+    values: np.ndarray
     """condensed tangent in the order of the pattern, mN/mm, (n_nonzeros,)"""
-    rigid_force: Array
+    rigid_force: np.ndarray
     """-d Pi/dq: force on the modelled part of the jaws, mN, (n_q,)"""
-    coupling: Array
+    coupling: np.ndarray
     """d2 Pi/dx dq on the free degrees of freedom, mN/mm, (n_free, n_q)"""
-    rigid_stiffness: Array
+    rigid_stiffness: np.ndarray
     """d2 Pi/dq2, mN/mm, (n_q, n_q)"""
-    J_min: Array
+    J_min: float
     """smallest volume ratio at a point"""
-    J_max: Array
+    J_max: float
     """largest volume ratio at a point"""
 
     @property
-    def jaw_force(self) -> Array:
+    def jaw_force(self) -> float:
         """Force on the modelled part of the jaws, mN."""
-        return self.rigid_force[0]
+        return float(self.rigid_force[0])
 
 
 # --- pieces -----------------------------------------------------------------------------------------
 
 
-@jax.jit
 def cut(group: Group, state: State) -> list[Piece]:
-    """A group at a state cut into its blocks.
+    """A group at a state cut into its blocks, on the host.
 
-    A program of its own: slices inside the program that differentiates would keep it from being vectorised.
+    Slices inside the program that differentiates would keep it from being vectorised.
     """
+    group, state = jax.tree_util.tree_map(np.asarray, (group, state))
     return [piece(group, state, *block) for block in group.blocks]
 
 
@@ -198,29 +205,29 @@ def linearise_piece(piece: Piece) -> Linearised:
     """
     y = at_points(piece.stencil, piece.x)
     names, shape, n_c = list(y), y[0, 0].shape, piece.stencil.shape[1]
+    n_y, known = len(names), list(zip(piece.densities, piece.heres, strict=True))
     moving = [jnp.broadcast_to(q, shape) for q in piece.q] if piece.moved else []
+    parts = []
+    if piece.pressures is not None:  # the solid comes first, and its pressures with it
+        parts.append(wall_derivatives(y, _interpolated(piece.pressures), known.pop(0)[1]))
 
     def density(v: list[Array]) -> Array:
-        at, q = dict(zip(names, v[: len(names)], strict=True)), v[len(names) :] or piece.q
-        known = list(zip(piece.densities, piece.heres, strict=True))
-        terms = []
-        if piece.pressures is not None:  # the solid comes first, and its pressures with it
-            terms.append(mixed_energy(at, _interpolated(piece.pressures), known.pop(0)[1]))
-        terms += [one(at, q, here) for one, here in known]
-        return total(terms)
+        at, q = dict(zip(names, v[:n_y], strict=True)), v[n_y:] or piece.q
+        return total(one(at, q, here) for one, here in known)
 
-    value, first, second = pointwise_derivatives(density, [*y.values(), *moving])
-    n_y = len(names)
-    moduli = second[:n_y, :n_y].reshape(n_c, 3, n_c, 3, *shape)
-    six = jnp.stack([moduli[:, i, :, j] for i, j in PAIRS], axis=2)
+    if known:
+        value, slope, second = pointwise_derivatives(density, [*y.values(), *moving])
+        square = by_pairs(second[:n_y, :n_y].reshape(n_c, 3, n_c, 3, *shape))
+        parts.append((value, slope[:n_y].reshape(n_c, 3, *shape), square))
+    values, first, moduli = (total(each) for each in zip(*parts, strict=True))
     found: dict[str, Any] = {
-        "energy": jnp.sum(value),
-        "force": to_nodes(piece.stencil, first[:n_y].reshape(n_c, 3, *shape)),
-        "matrix": to_matrices(piece.stencil, six),
+        "energy": jnp.sum(values),
+        "force": to_nodes(piece.stencil, first),
+        "matrix": to_matrices(piece.stencil, moduli),
     }
     if piece.moved:
         mixed = second[n_y:, :n_y].reshape(len(moving), n_c, 3, *shape)
-        found["rigid_slope"] = jnp.sum(first[n_y:], axis=(1, 2))
+        found["rigid_slope"] = jnp.sum(slope[n_y:], axis=(1, 2))
         found["coupling"] = jnp.stack([to_nodes(piece.stencil, part) for part in mixed])
         found["rigid_stiffness"] = jnp.sum(second[n_y:, n_y:], axis=(2, 3))
     if piece.pressures is not None:
@@ -262,68 +269,60 @@ def _condensed(
 # --- the whole --------------------------------------------------------------------------------------
 
 
-def linearise(potential: Potential, state: State) -> Linearisation:
+def linearise(potential: Potential, state: State, pattern: Pattern) -> Linearisation:
     """Forces and condensed tangent at a state, piece by piece."""
     pieces = [[linearise_piece(one) for one in cut(group, state)] for group in potential.groups]
-    return assemble(potential, pieces)
+    with np.errstate(over="ignore", invalid="ignore"):  # a trial state may be absurd
+        return assemble(potential, pattern, jax.device_get(pieces))
 
 
-@jax.jit
-def assemble(potential: Potential, pieces: list[list[Linearised]]) -> Linearisation:
-    """Pieces summed into residual and tangent."""
-    layout = potential.layout
-    # one scatter per block: XLA's is many times slower on a concatenation
-    values = jnp.zeros(layout.n_nonzeros + 1)
-    force = jnp.zeros((layout.n_nodes, 3))
-    missing = jnp.zeros_like(force)
+def assemble(potential: Potential, pattern: Pattern, pieces: list[list[Linearised]]) -> Linearisation:
+    """Pieces summed into residual and tangent, on the host: a sum is no program to compile."""
+    layout, n_q = potential.layout, len(RIGID)
+    free = np.asarray(layout.free)
+    values = np.zeros(len(pattern.indices))
+    wall, missing, loads = np.zeros((3, layout.n_nodes, 3))
+    slope, stiffness, coupling = np.zeros(n_q), np.zeros((n_q, n_q)), np.zeros((n_q, layout.n_nodes, 3))
     for group, blocks in zip(potential.groups, pieces, strict=True):
-        for (first, last), slots, block in zip(group.blocks, group.slots, blocks, strict=True):
-            nodes = group.nodes[:, first:last]
-            values = values.at[slots].add(block.matrix.ravel(), mode="promise_in_bounds")
-            force = _added(force, nodes, block.force)
-            if block.missing_force is not None:
-                missing = _added(missing, nodes, block.missing_force)
-    imbalance = jnp.linalg.norm(force.ravel()[layout.free])
-    force = (force + missing).ravel()
-    slope, coupling, stiffness = _rigid(potential, pieces)
+        nodes = np.asarray(group.nodes)
+        joined = lambda of: np.concatenate([of(block) for block in blocks], axis=-1)  # noqa: B023, E731
+        values += pattern.places[group.region] @ np.concatenate([block.matrix.ravel() for block in blocks])
+        _add(loads if group.volume is None else wall, nodes, joined(lambda block: block.force))
+        if group.volume is not None:
+            _add(missing, nodes, joined(lambda block: block.missing_force))
+        if group.moved:
+            for block in blocks:
+                slope += np.asarray(block.rigid_slope)
+                stiffness += np.asarray(block.rigid_stiffness)
+            for field, cells in zip(coupling, joined(lambda block: block.coupling), strict=True):
+                _add(field, nodes, cells)
+    imbalance = np.linalg.norm((wall + loads).ravel()[free])
+    residual = (wall + missing + loads).ravel()
+    held = np.delete(residual, free)
     every = [block for blocks in pieces for block in blocks]
-    J = jnp.stack([block.J_range for block in every if block.J_range is not None])
-    errors = [block.volume_error for block in every if block.volume_error is not None]
+    of_wall = [block for block in every if block.J_range is not None]
+    J = np.array([block.J_range for block in of_wall])
     return Linearisation(
-        energy=total(block.energy for block in every),
-        residual=force[layout.free],
-        imbalance=imbalance,
-        reactions=jnp.linalg.norm(force.at[layout.free].set(0.0)),
-        volume_error=jnp.max(jnp.stack(errors)),
-        values=values[:-1],
+        energy=sum(float(block.energy) for block in every),
+        wall_energy=sum(float(block.energy) for block in of_wall),
+        wall_force=wall + missing,
+        residual=residual[free],
+        imbalance=float(imbalance),
+        reactions=float(np.linalg.norm(held)),
+        volume_error=float(np.max(np.array([block.volume_error for block in of_wall]))),
+        values=values,
         rigid_force=-slope,
-        coupling=coupling,
+        coupling=coupling.reshape(n_q, -1)[:, free].T,
         rigid_stiffness=stiffness,
-        J_min=jnp.min(J),
-        J_max=jnp.max(J),
+        J_min=float(np.min(J)),
+        J_max=float(np.max(J)),
     )
 
 
-def _added(field: Array, nodes: AnyArray, cells: Array) -> Array:
-    """A field (n_nodes, 3) with what cells have at their nodes (n_en, 3, n_cells) added."""
-    return field.at[nodes].add(jnp.swapaxes(cells, 1, 2))
-
-
-def _rigid(potential: Potential, pieces: list[list[Linearised]]) -> tuple[Array, Array, Array]:
-    """Derivatives of Pi by q: slope (n_q,), coupling with the unknowns (n_free, n_q), stiffness."""
-    layout, n_q = potential.layout, len(RIGID)
-    slope, stiffness = jnp.zeros(n_q), jnp.zeros((n_q, n_q))
-    mixed = [jnp.zeros((layout.n_nodes, 3)) for _ in range(n_q)]
-    for group, blocks in zip(potential.groups, pieces, strict=True):
-        for (first, last), block in zip(group.blocks, blocks, strict=True):
-            if block.coupling is None:
-                continue
-            assert block.rigid_slope is not None
-            assert block.rigid_stiffness is not None
-            slope, stiffness = slope + block.rigid_slope, stiffness + block.rigid_stiffness
-            nodes = group.nodes[:, first:last]
-            mixed = [_added(field, nodes, part) for field, part in zip(mixed, block.coupling, strict=True)]
-    return slope, jnp.stack([field.ravel()[layout.free] for field in mixed], axis=1), stiffness
+def _add(field: np.ndarray, nodes: np.ndarray, cells: np.ndarray) -> None:
+    """Add to a field (n_nodes, 3) what cells have at their nodes (n_en, 3, n_cells)."""
+    for i in range(3):
+        field[:, i] += np.bincount(nodes.ravel(), cells[:, i].ravel(), len(field))
 
 
 def on_nodes(layout: Layout, v: Array) -> Array:
@@ -331,10 +330,14 @@ def on_nodes(layout: Layout, v: Array) -> Array:
     return jnp.zeros(3 * layout.n_nodes).at[layout.free].set(v).reshape(layout.n_nodes, 3)
 
 
-@jax.jit
-def advance(potential: Potential, state: State, dx: Array, dq: Array, fraction: Array) -> State:
+def advance(potential: Potential, state: State, dx: AnyArray, dq: AnyArray, fraction: float) -> State:
     """Go a fraction of the Newton step: free unknowns dx (n_free,), dq (n_q,), and condensed pressures."""
-    step = on_nodes(potential.layout, dx)
+    return _advance(potential.wall, state, dx, dq, fraction)
+
+
+@jax.jit
+def _advance(wall: Potential, state: State, dx: Array, dq: Array, fraction: Array) -> State:
+    step = on_nodes(wall.layout, dx)
 
     def condensed(group: Group) -> Array:
         assert group.volume is not None
@@ -344,5 +347,5 @@ def advance(potential: Potential, state: State, dx: Array, dq: Array, fraction: 
         now, change = jax.jvp(D, (state.x,), (step,))
         return condensed_pressures(group.volume.stiffness, now + change)
 
-    dp = cell_pressures(potential, condensed) - state.p
+    dp = cell_pressures(wall, condensed) - state.p
     return State(x=state.x + fraction * step, p=state.p + fraction * dp, q=state.q + fraction * dq)

@@ -90,8 +90,6 @@ class Group:
     """(n_en, n_cells)"""
     blocks: tuple[tuple[int, int], ...] = static()
     """first and last-plus-one cell of each piece"""
-    slots: tuple[np.ndarray, ...]
-    """where the matrices of each piece go, see `fem.pattern.Region`"""
     stencil: Array
     """(n_q, n_c, n_en)"""
     terms: tuple[Term, ...]
@@ -139,6 +137,11 @@ class Potential:
     def layers(self) -> tuple[Group, ...]:
         """The groups of the wall, from inside to outside."""
         return tuple(group for group in self.groups if group.volume is not None)
+
+    @property
+    def wall(self) -> Potential:
+        """The potential of the wall alone."""
+        return dataclasses.replace(self, groups=self.layers)
 
     def keeping(self, wanted: Callable[[str], bool]) -> Potential:
         """The potential with those terms alone that are wanted, by name."""
@@ -363,7 +366,6 @@ def build_potential(
             region=place[0],
             nodes=region.nodes,
             blocks=region.blocks,
-            slots=region.slots,
             stencil=jnp.asarray(at[place[1]]),
             terms=tuple(t for t in members if isinstance(t, Term)),
             volume=volume,

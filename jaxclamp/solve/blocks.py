@@ -129,7 +129,7 @@ def settle(
     x = block.positions if start is None else np.asarray(start, float)
     size = float(np.max(np.ptp(block.positions, axis=0)))
     solver = LinearSolver(block.pattern)
-    system = System(block.potential, solver, tolerance, size, block.pattern.diagonal)
+    system = System(block.potential, solver, tolerance, size, block.pattern)
     height = OPEN if jaw_height is None else jaw_height
     top = float(np.max(x[:, 1]))
     found, way = None, np.where(block.held, np.asarray(moved) - x, 0.0) / steps

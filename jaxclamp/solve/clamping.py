@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -73,12 +74,15 @@ def require_a_gap(scene: Scene) -> None:
     depth = 0.1 * float(scene.clamp.jaw.half_extent())
     heights = np.array([-far, -depth, 0.0, depth])
     points = (jnp.zeros(4), jnp.asarray(heights), jnp.zeros(4))
-    gap = np.asarray(scene.clamp.jaw.gap(points))
+    gap = np.asarray(_gap(scene.clamp.jaw, points))
     wanted = "a gap that is positive below the jaw's lowest point, 0 there and negative inside the jaw"
     good = np.all(np.isfinite(gap)) and gap[0] > 0.0 and gap[1] > 0.0 and gap[3] < 0.0
     if not good or abs(gap[2]) > 1e-6 * depth:
         shown = ", ".join(f"{g:.3g} mm at y = {y:.3g} mm" for g, y in zip(gap, heights, strict=True))
         raise SceneError(f"clamp.jaw of shape '{scene.clamp.jaw.shape}': expected {wanted}; it is {shown}")
+
+
+_gap = jax.jit(lambda jaw, points: jaw.gap(points))
 
 
 def _from_neighbour(

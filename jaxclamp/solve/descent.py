@@ -52,7 +52,7 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
     lin = system.linearise(state, step.pressure)
     if not sound(lin):
         raise NotConverged("the predicted state is inverted", residual_norm(lin), float(lin.J_min))
-    unit = 1e-3 * float(np.median(lin.values[system.diagonal]))
+    unit = 1e-3 * float(np.median(lin.values[system.pattern.diagonal]))
     shift, unstable = 0.0, False
     for iteration in range(MAX_DESCENT):
         if converged(system, state, lin, 0.0):
@@ -146,7 +146,7 @@ def descend_eased(system: System, state: State, step: Step, ease: Ease) -> Equil
 def _downhill_step(system: System, lin: Linearisation, shift: float) -> np.ndarray | None:
     """-(K + shift I)^-1 residual, (n_free,); None if that matrix is not positive definite."""
     values = np.array(lin.values)
-    values[system.diagonal] += shift
+    values[system.pattern.diagonal] += shift
     try:
         negative = system.solver.factor(values)
         dx = system.solver.solve(-np.asarray(lin.residual)[:, None])[:, 0]

@@ -68,7 +68,8 @@ def inflated_radius(artery: Artery, load_free_radius: float) -> float | None:
     return float(radii[nearest] - b / (2.0 * a)) if a > 0.0 else float(radii[nearest])
 
 
-def inflated_positions(x: Array, artery: Artery, load_free_radius: float, radius: float) -> Array:
+@jax.jit
+def inflated_positions(x: Array, artery: Artery, load_free_radius: Array, radius: Array) -> Array:
     """Load-free positions x (n_nodes, 3) moved with an incompressible tube to a new inner radius, mm."""
     stretch = artery.axial_stretch
     squared = x[:, 0] ** 2 + x[:, 1] ** 2

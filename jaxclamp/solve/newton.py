@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxclamp.core.failures import Exhausted, NotConverged, Singular
+from jaxclamp.fem.pattern import Pattern
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.tangent import Linearisation, advance, linearise
 from jaxclamp.potential.terms import BLOOD, Potential
@@ -96,8 +97,8 @@ class System:
     """largest residual over the norm of the support reactions"""
     length: float
     """lumen radius, mm: the scale of moves"""
-    diagonal: np.ndarray
-    """place of each diagonal entry in the values of the tangent, (n_free,)"""
+    pattern: Pattern
+    """of the tangent"""
     newton_iterations: int = 0
     """so far"""
     load_steps: int = 0
@@ -123,7 +124,7 @@ class System:
         if self.linearisations >= self.patience:
             raise Exhausted(f"no way was found in {MAX_LINEARISATIONS} assemblies")
         start = time.perf_counter()
-        lin: Linearisation = jax.device_get(linearise(self.at(pressure), state))
+        lin = linearise(self.at(pressure), state, self.pattern)
         seconds = time.perf_counter() - start
         if self.linearisations == 0:
             self.first_seconds = seconds
@@ -156,7 +157,7 @@ def converged(system: System, state: State, lin: Linearisation, off: float) -> b
     off: how far the jaw is from where the closing holds, mm
     """
     free = np.asarray(state.x).reshape(-1)[np.asarray(system.potential.layout.free)]
-    forces = lin.values[system.diagonal] * free
+    forces = lin.values[system.pattern.diagonal] * free
     sane = float(np.max(np.abs(forces), initial=0.0)) < LARGEST_FORCE
     rounding = ROUND_OFF * float(np.linalg.norm(forces)) if sane else 0.0
     # rigid coordinates that nothing drives are in equilibrium, too

@@ -82,7 +82,7 @@ class Clamping:
         else:
             solver = before.solver
         self.solver: LinearSolver = solver
-        self.system = System(model.potential, solver, settings.tolerance, 1.0, model.pattern.diagonal)
+        self.system = System(model.potential, solver, settings.tolerance, 1.0, model.pattern)
         if before is not None:
             self.system.count_on(before.system)
 
@@ -99,6 +99,7 @@ class Clamping:
                 marks=self.model.marks,
                 states=(base, state),
                 known_stresses=(base_stresses, seen),
+                known_wall=(equilibrium.lin.wall_energy, equilibrium.lin.wall_force),
             )
         )
         if closing:

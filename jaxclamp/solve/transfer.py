@@ -46,7 +46,7 @@ def _lines(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (
         np.asarray(axial_fractions(mesh, settings)),
         np.asarray(angles(mesh, settings)),
-        mesh.node_layer + mesh.node_fraction,
+        np.asarray(mesh.node_layer) + mesh.node_fraction,
     )
 
 

@@ -150,16 +150,16 @@ def predicted(result: Result, scene: Scene) -> Result:
     clamping.use_terms(closing=False)
     clamping.refer_to(base.state)
     near = _predicted(clamping, result, base, clamping.step(Held(float(base.state.jaw_height))))
-    clamping.keep("physiological", dataclasses.replace(base, state=near), 1.0, "")
+    clamping.keep("physiological", near, 1.0, "")
     if last.stage == "clamping":
         clamping.use_terms(closing=True)
         step = clamping.at_stop(last.equilibrium.state)
-        near = _predicted(clamping, result, last.equilibrium, step)
-        clamping.keep("clamping", dataclasses.replace(last.equilibrium, state=near), 1.0, "")
+        clamping.keep("clamping", _predicted(clamping, result, last.equilibrium, step), 1.0, "")
     return dataclasses.replace(result, model=model, states=tuple(clamping.states))
 
 
-def _predicted(clamping: Clamping, result: Result, near: Equilibrium, step: Step) -> State:
+def _predicted(clamping: Clamping, result: Result, near: Equilibrium, step: Step) -> Equilibrium:
     """The state of a step to first order, with the factors that the result has of a near one."""
     with result.factors.lease(np.asarray(near.lin.values)) as solver:
-        return predict(dataclasses.replace(clamping.system, solver=solver), near, step)
+        state = predict(dataclasses.replace(clamping.system, solver=solver), near, step)
+    return dataclasses.replace(near, state=state, lin=clamping.system.linearise(state, step.pressure))

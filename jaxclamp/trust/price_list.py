@@ -198,7 +198,8 @@ def _in_single_precision(result: Result) -> tuple[None, str]:
     )
     last = result.states[-1].equilibrium
     with jax.numpy_dtype_promotion("standard"):
-        lin = linearise(single(result.model.potential), single(last.state))
+        model = result.model
+        lin = linearise(single(model.potential), single(last.state), model.pattern)
     left = float(np.linalg.norm(np.asarray(lin.residual, float))) / float(last.lin.reactions)
     return None, (
         f"forces of float32 leave {left:.1g} of the reactions at the solution of float64: not admissible"

@@ -72,7 +72,7 @@ def newton_alone(scene: Scene, u: np.ndarray, pressures: Sequence[float]) -> wor
         solver=LinearSolver(model.pattern, scene.solver.linear_solver),
         tolerance=scene.solver.tolerance,
         length=work.INNER_RADIUS,
-        diagonal=model.pattern.diagonal,
+        pattern=model.pattern,
     )
     mesh = work.tube_mesh(scene.mesh.circumferential, scene.mesh.axial, *scene.mesh.radial)
     far = 1e3
