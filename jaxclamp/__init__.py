@@ -10,9 +10,9 @@ jax.config.update("jax_enable_x64", True)
 from jaxclamp.core.failures import EquilibriumError, SceneError  # noqa: E402
 from jaxclamp.core.progress import Progress  # noqa: E402
 from jaxclamp.observe.figures import shown_in  # noqa: E402
+from jaxclamp.observe.measure import Measure  # noqa: E402
 from jaxclamp.observe.measures import (  # noqa: E402
     MEASURES,
-    Measure,
     axial_stress_at_P,
     circumferential_stress_at_P,
     clamp_force,

@@ -26,7 +26,7 @@ class Pattern:
     """place of each row's first entry, (n + 1,)"""
     indices: np.ndarray
     """column of each entry, (n_nonzeros,)"""
-    places: dict[str, sp.csr_matrix]
+    places: dict[str, sp.csr_matrix] = dataclasses.field(default_factory=dict)
     """by region: the entries of its matrices [a, b, pair, cell], block by block, summed into the tangent's
     values; (n_nonzeros, number of entries), ones"""
 

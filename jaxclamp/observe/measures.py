@@ -8,9 +8,7 @@ the place of the true peak jumps; `Result` gives the true peaks beside them.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +18,7 @@ from jax.nn import sigmoid
 from jaxclamp.core.tensors import smooth_maximum, total
 from jaxclamp.fem import landmarks
 from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.measure import Measure
 from jaxclamp.observe.stresses import facet_contact, touching
 from jaxclamp.potential.energy import group_energy
 from jaxclamp.potential.energy import stored_energy as _stored_energy
@@ -27,39 +26,6 @@ from jaxclamp.potential.terms import JAWS, Potential
 
 PEAK_SHARPNESS = 40.0
 """exponent of the power mean that stands for a maximum"""
-
-
-@dataclasses.dataclass(frozen=True)
-class Measure:
-    """A scalar function of the equilibria. Two measures of one name and arguments are equal."""
-
-    name: str
-    """such as smooth_peak_axial_stress"""
-    unit: str
-    """internal unit: mm, kPa, mN, uJ, or none"""
-    function: Callable[..., Array]
-    """of the equilibria and the arguments: a JAX scalar"""
-    arguments: tuple[str | float, ...] = ()
-    """such as a layer's name"""
-    needs_stop: bool = True
-    """False: the physiological state is all that it needs"""
-
-    def __call__(self, equilibria: Equilibria) -> Array:
-        """The value in internal units, a JAX scalar."""
-        return self.function(equilibria, *self.arguments)
-
-    def __str__(self) -> str:
-        inside = ", ".join(map(str, self.arguments))
-        return f"{self.name}({inside})"
-
-
-def require_measure(found: Any) -> Measure:
-    """The measure, or a TypeError that says what to write instead."""
-    if isinstance(found, Measure):
-        return found
-    name = getattr(found, "__name__", None)
-    said = f"the function {name}; call it, such as {name}()" if callable(found) and name else repr(found)
-    raise TypeError(f"expected a measure, found {said}")
 
 
 SMOOTHNESS_OF_THRESHOLD = 0.05
@@ -154,7 +120,7 @@ def jaw_half_width() -> Measure:
     return Measure("jaw_half_width", "mm", _jaw_half_width)
 
 
-MEASURES: tuple[Callable[..., Measure], ...] = (
+MEASURES: list[Callable[..., Measure]] = [
     smooth_peak_axial_stress,
     smooth_peak_circumferential_stress,
     smooth_peak_principal_stress,
@@ -172,8 +138,23 @@ MEASURES: tuple[Callable[..., Measure], ...] = (
     physiological_lumen_radius,
     jaw_curvature,
     jaw_half_width,
-)
+]
 """every factory: study files can name those at the stop by the measure's name and unit"""
+
+Factory = Callable[..., Measure]
+
+
+def measure_of_files(factory: Factory) -> Factory:
+    """Let study files name a measure of one's own: a decorator of its factory.
+
+    The key is the measure's name and unit; arguments may be `layer` (the name of one) and `stress` (kPa).
+    Raises ValueError for a name that is taken.
+    """
+    taken = {known.__name__ for known in MEASURES if known.__module__ != factory.__module__}
+    if factory.__name__ in taken:
+        raise ValueError(f"there is a measure {factory.__name__} already: expected another name")
+    MEASURES[:] = [known for known in MEASURES if known.__name__ != factory.__name__] + [factory]
+    return factory
 
 
 # --- the functions ------------------------------------------------------------------------------
