@@ -3,7 +3,11 @@
 Importing the package switches JAX to 64-bit floats: stresses near incompressibility need them.
 """
 
-import jax
+from jaxclamp.core.signals import guard_start
+
+guard_start()
+
+import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.nn import sigmoid
 
+from jaxclamp.core.surroundings import require_fit
 from jaxclamp.core.tensors import smooth_maximum, total
 from jaxclamp.fem import landmarks
 from jaxclamp.observe.equilibria import Equilibria
@@ -54,7 +55,8 @@ class Measure:
 
 
 def require_measure(found: Any) -> Measure:
-    """The measure, or a TypeError that says what to write instead."""
+    """The measure, or a TypeError that says what to write instead; Unfit if this process cannot compute."""
+    require_fit()
     if isinstance(found, Measure):
         return found
     name = getattr(found, "__name__", None)

@@ -8,13 +8,13 @@ ends as a `SceneError`, one sentence.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from jaxclamp.core.failures import BadKey, SceneError
+from jaxclamp.core.surroundings import require_fit
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.checks import check, check_mesh, check_signs, check_target
@@ -23,6 +23,7 @@ from jaxclamp.scenes.overrides import apply_override
 from jaxclamp.scenes.presets import preset
 from jaxclamp.scenes.scene import Artery, Scene
 from jaxclamp.scenes.schema import refuse
+from jaxclamp.scenes.toml import parsed
 from jaxclamp.scenes.wording import shortened
 
 LARGEST_FILE = 1_000_000
@@ -76,7 +77,8 @@ def require_possible(scene: Scene) -> None:
 
 
 def require_scene(found: Any) -> None:
-    """Raise TypeError for what is no scene."""
+    """Raise TypeError for what is no scene, Unfit if this process cannot compute."""
+    require_fit()
     if not isinstance(found, Scene):
         said = shortened(repr(found))
         raise TypeError(f"expected a scene, such as jaxclamp.load_scene('human-lad'), found {said}")
@@ -138,10 +140,8 @@ def read_text(name_or_path: str | Path, kind: str = "scene") -> tuple[str, str]:
 
 
 def _parsed(text: str, source: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise SceneError(f"{source}: not valid TOML: {' '.join(str(error).split())}") from None
+    with _refusals(source):
+        return parsed(text)
 
 
 def _expand(table: dict[str, Any], source: str) -> None:
@@ -155,7 +155,7 @@ def _expand(table: dict[str, Any], source: str) -> None:
         if isinstance(name, str):
             where = key if kind == "artery" else f"clamp.{key}"
             try:
-                owner[key] = tomllib.loads(preset(name, kind).text)
+                owner[key] = parsed(preset(name, kind).text)
             except SceneError as error:
                 raise SceneError(f"{source}: {where} = {schema.shown(name)}: {error}") from None
 
