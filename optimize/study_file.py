@@ -7,8 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxclamp import Progress, Scene, SceneError, load_scene
-from jaxclamp.core.failures import BadKey
+from jaxclamp import Failure, Progress, Scene, SceneError, load_scene
 from jaxclamp.scenes.address import describe
 from jaxclamp.scenes.files import read_text
 from jaxclamp.scenes.schema import shown, toml_value
@@ -78,7 +77,7 @@ def load_study(name_or_path: str | Path) -> StudyFile:
     text, source = read_text(name_or_path, "study")
     try:
         table = parsed(text)
-    except BadKey as error:
+    except Failure as error:
         raise SceneError(f"{source}: {error}") from None
     try:
         return _study(table, Path(name_or_path).parent)

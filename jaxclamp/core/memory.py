@@ -6,6 +6,14 @@ from pathlib import Path
 
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 """where Linux tells"""
+ADDRESSES = "ulimit -v"
+"""what limits addresses rather than memory: much of them is never used"""
+
+
+def resident_MB() -> float | None:
+    """Memory that this process has now, MB; None where the system does not tell."""
+    size = _kB(PROC / "self" / "status", "VmRSS:")
+    return None if size is None else size / 1024.0
 
 
 def free_MB() -> tuple[float, str] | None:
@@ -33,7 +41,7 @@ def _of_address_space() -> tuple[float, str] | None:
     size = _kB(PROC / "self" / "status", "VmSize:")
     if limit == resource.RLIM_INFINITY or size is None:
         return None
-    return limit / 2**20 - size / 1024.0, "ulimit -v"
+    return limit / 2**20 - size / 1024.0, ADDRESSES
 
 
 def _of_groups() -> list[tuple[float, str] | None]:

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args, get_origin
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxclamp.core.failures import BadAddress
+from jaxclamp.core.failures import BadAddress, BadKey, SceneError
 from jaxclamp.core.records import UNIT_FACTOR, Range
 from jaxclamp.scenes.schema import file_key, in_file_unit
+from jaxclamp.scenes.values import check_part, check_value, hints_of
 from jaxclamp.scenes.wording import did_you_mean, shortened
 
 LONGEST = 300
@@ -99,13 +100,49 @@ def replace(scene: Any, address: str, value: Any) -> Any:
     value: in internal units (mm, kPa, mN, radians), or in the unit that the address names ("stop.force_N");
     it may be traced. An item of an array ("clamp.jaw.slopes[1]") makes the array one of JAX.
 
-    Raises BadAddress, a SceneError and a KeyError, if there is no such place.
+    Raises BadAddress, a SceneError and a KeyError, if there is no such place, and SceneError for a value that
+    no scene file could hold there. Whether the scene is possible as a whole is seen when it is solved.
     """
     found = _find(scene, address)
-    changed = value if found.factor == 1.0 else value * found.factor
+    inside = _internal(value, found.factor)
+    try:
+        _check(found, inside)
+    except BadKey as error:
+        raise SceneError(str(error)) from None
+    return _put(found, inside)
+
+
+def changed(scene: Any, address: str, value: Any) -> Any:
+    """As `replace`, with a value that may lie outside of its range, such as a penalty made stiffer."""
+    found = _find(scene, address)
+    return _put(found, _internal(value, found.factor))
+
+
+def _internal(value: Any, factor: float) -> Any:
+    """A value in internal units; what is no number is left as it is."""
+    return value if factor == 1.0 or isinstance(value, str | bool | None) else value * factor
+
+
+def _put(found: _Found, value: Any) -> Any:
+    """A copy of the scene with another value at a place."""
     for node, step in zip(reversed(found.nodes), reversed(found.steps), strict=True):
-        changed = _with(node, step, changed)
-    return changed
+        value = _with(node, step, value)
+    return value
+
+
+def _check(found: _Found, value: Any) -> None:
+    """Raise BadKey for a value that cannot stand at a place."""
+    last = max((i for i, step in enumerate(found.steps) if isinstance(step, str)), default=0)
+    owner, name = found.nodes[last], found.steps[last]
+    hint = hints_of(type(owner)).get(str(name))
+    field = next(f for f in dataclasses.fields(owner) if f.name == name)
+    key = text((*found.steps[:last], file_key(field), *found.steps[last + 1 :]))
+    if last == len(found.steps) - 1 or "range" in field.metadata:
+        check_value(field, hint, value, key)
+    elif get_origin(hint) is tuple and dataclasses.is_dataclass(found.value):
+        check_part(get_args(hint)[0], value, key)
+    else:  # an item of a list of whole numbers
+        check_value(field, hint, (value,), key)
 
 
 def describe(scene: Any, address: str) -> Place:

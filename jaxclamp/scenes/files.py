@@ -17,13 +17,14 @@ from jaxclamp.core.failures import BadKey, SceneError
 from jaxclamp.core.surroundings import require_fit
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.scenes import schema
-from jaxclamp.scenes.checks import check, check_mesh, check_signs, check_target
+from jaxclamp.scenes.checks import check
 from jaxclamp.scenes.fidelity import COUNTS, FIDELITIES, mesh_for
 from jaxclamp.scenes.overrides import apply_override
 from jaxclamp.scenes.presets import preset
 from jaxclamp.scenes.scene import Artery, Scene
 from jaxclamp.scenes.schema import refuse
 from jaxclamp.scenes.toml import parsed
+from jaxclamp.scenes.values import check_values
 from jaxclamp.scenes.wording import shortened
 
 LARGEST_FILE = 1_000_000
@@ -85,17 +86,15 @@ def require_scene(found: Any) -> None:
 
 
 def require_computable(scene: Scene) -> None:
-    """Refuse what cannot be solved: no scene, a number that is none, not finite, or not positive where it
-    has to be, a target out of its range, counts of elements that do not fit the layers.
+    """Refuse what a file with the same values would be refused for, and what is no scene.
 
-    Less than `require_possible`: differences may step over the ends of ranges. Raises TypeError for what is
+    Unlike `require_possible`, a material's constants may be arrays over points. Raises TypeError for what is
     no scene, SceneError for the rest.
     """
     require_scene(scene)
     with _refusals("scene"):
-        check_signs(scene)
-        check_target(scene)
-        check_mesh(scene)
+        check_values(scene)
+        check(scene)
 
 
 @contextmanager
