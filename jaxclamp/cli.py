@@ -265,7 +265,7 @@ def presets(
 
 
 def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:
-    from jaxclamp.scenes.fidelity import EXPECTED_ERRORS
+    from jaxclamp.scenes.fidelity import ERRORS_ON_HUMAN_LAD
     from jaxclamp.scenes.files import load_scene, own_mesh_keys
 
     loaded = load_scene(scene, overrides or (), fidelity or "standard")
@@ -275,8 +275,11 @@ def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: 
         keys = ", ".join(f"mesh.{key}" for key in own)
         typer.echo(f"note: {scene} sets {keys} itself; --fidelity {fidelity} leaves that as it is", err=True)
     else:
-        errors = ", ".join(f"{error:.1%} in the {name}" for name, error in EXPECTED_ERRORS[fidelity].items())
-        typer.echo(f"note: --fidelity {fidelity}: expect errors of about {errors}", err=True)
+        errors = ", ".join(
+            f"{error:.1%} in the {name}" for name, error in ERRORS_ON_HUMAN_LAD[fidelity].items()
+        )
+        said = f"on human-lad, errors of {errors}; those of this scene are estimated at the end"
+        typer.echo(f"note: --fidelity {fidelity}: {said}", err=True)
     return loaded
 
 
