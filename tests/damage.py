@@ -78,7 +78,7 @@ def edit(draw: Callable[[Any], Any], table: dict[str, Any], junk: Any = JUNK) ->
         elif kind == "number":
             owner[key] = draw(NUMBERS)
         elif kind == "nest":
-            owner[key] = draw(st.sampled_from([[value], {"a": value}, [[[value]]], {key: value}]))
+            owner[key] = draw(st.sampled_from([[value], {"a": value}, [[[value]]], {str(key): value}]))
         elif kind == "negate" and isinstance(value, int | float):
             owner[key] = -value
         elif kind == "repeat" and isinstance(value, list):

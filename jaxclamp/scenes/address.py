@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from typing import Any, NamedTuple, get_args, get_origin
+from typing import Any, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from jaxclamp.core.failures import BadAddress, BadKey, SceneError
 from jaxclamp.core.records import UNIT_FACTOR, Range
 from jaxclamp.scenes.schema import file_key, in_file_unit
-from jaxclamp.scenes.values import check_part, check_value, hints_of
+from jaxclamp.scenes.values import check_part, check_value, hints_of, numbers
 from jaxclamp.scenes.wording import did_you_mean, shortened
 
 LONGEST = 300
@@ -100,8 +100,9 @@ def replace(scene: Any, address: str, value: Any) -> Any:
     value: in internal units (mm, kPa, mN, radians), or in the unit that the address names ("stop.force_N");
     it may be traced. An item of an array ("clamp.jaw.slopes[1]") makes the array one of JAX.
 
-    Raises BadAddress, a SceneError and a KeyError, if there is no such place, and SceneError for a value that
-    no scene file could hold there. Whether the scene is possible as a whole is seen when it is solved.
+    Raises BadAddress, a SceneError and a KeyError, if there is no such place, and SceneError for a value of a
+    kind that cannot stand there. Ranges are seen when the scene is solved: gradients and directions are
+    scenes too, whose floats may have any value.
     """
     found = _find(scene, address)
     inside = _internal(value, found.factor)
@@ -110,12 +111,6 @@ def replace(scene: Any, address: str, value: Any) -> Any:
     except BadKey as error:
         raise SceneError(str(error)) from None
     return _put(found, inside)
-
-
-def changed(scene: Any, address: str, value: Any) -> Any:
-    """As `replace`, with a value that may lie outside of its range, such as a penalty made stiffer."""
-    found = _find(scene, address)
-    return _put(found, _internal(value, found.factor))
 
 
 def _internal(value: Any, factor: float) -> Any:
@@ -131,18 +126,19 @@ def _put(found: _Found, value: Any) -> Any:
 
 
 def _check(found: _Found, value: Any) -> None:
-    """Raise BadKey for a value that cannot stand at a place."""
-    last = max((i for i, step in enumerate(found.steps) if isinstance(step, str)), default=0)
+    """Raise BadKey for a value of a kind that cannot stand at a place."""
+    last = max(i for i, step in enumerate(found.steps) if isinstance(step, str))
     owner, name = found.nodes[last], found.steps[last]
-    hint = hints_of(type(owner)).get(str(name))
     field = next(f for f in dataclasses.fields(owner) if f.name == name)
+    hint = hints_of(type(owner)).get(field.name)
     key = text((*found.steps[:last], file_key(field), *found.steps[last + 1 :]))
-    if last == len(found.steps) - 1 or "range" in field.metadata:
-        check_value(field, hint, value, key)
-    elif get_origin(hint) is tuple and dataclasses.is_dataclass(found.value):
-        check_part(get_args(hint)[0], value, key)
-    else:  # an item of a list of whole numbers
-        check_value(field, hint, (value,), key)
+    whole = last == len(found.steps) - 1
+    if "range" in field.metadata:
+        numbers(value, field.metadata["range"], key)
+    elif whole or field.metadata.get("static"):  # an item of a list of whole numbers is seen as a list
+        check_value(field, hint, value if whole else (value,), key, ranges=False)
+    else:
+        check_part(next(iter(get_args(hint)), None), value, key, ranges=False)
 
 
 def describe(scene: Any, address: str) -> Place:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any, get_args, get_origin, get_type_hints
 
 import jax
@@ -14,20 +13,21 @@ from jaxclamp.physics.materials import Material
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.schema import MOST_ITEMS, refuse
 
-ROUNDING = 1e-12
-"""relative difference to the end of a range that is none: units are changed back and forth"""
+BEYOND = 1e-6
+"""differences may step over the end of a range by this part of it (of the other end, if it is 0)"""
 NUMBERS = (int, float, list, tuple, np.number, np.ndarray, jax.Array)
 
 
-def check_values(record: Any, path: str = "") -> None:
+def check_values(record: Any, path: str = "", ranges: bool = True) -> None:
     """Raise BadKey for the first value that no scene file could hold; traced values are not known.
 
     What a file cannot hold and Python can: constants of a material that are arrays over points.
+    ranges: False if numbers may have any value
     """
     hints = hints_of(type(record))
     for field in dataclasses.fields(record):
         value, name = getattr(record, field.name), schema.join(path, schema.file_key(field))
-        check_value(field, hints.get(field.name), value, name)
+        check_value(field, hints.get(field.name), value, name, ranges)
         if "range" in field.metadata and not isinstance(record, Material):
             _check_shape(value, field, name)
 
@@ -40,10 +40,10 @@ def hints_of(cls: type) -> dict[str, Any]:
         return {}
 
 
-def check_value(field: dataclasses.Field[Any], hint: Any, value: Any, path: str) -> None:
+def check_value(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, ranges: bool = True) -> None:
     """Raise BadKey unless a value may stand in a field of a record; hint: its type, None if not known."""
     if "range" in field.metadata:
-        check_quantity(value, field.metadata["range"], path)
+        (check_quantity if ranges else numbers)(value, field.metadata["range"], path)
     elif field.metadata.get("static"):
         if hint is not None and not schema.is_tag(field):
             schema.check_static(field, hint, list(value) if isinstance(value, tuple) else value, path)
@@ -51,42 +51,51 @@ def check_value(field: dataclasses.Field[Any], hint: Any, value: Any, path: str)
         if not isinstance(value, tuple) or not 1 <= len(value) <= MOST_ITEMS:
             raise refuse(path, _words(value), f"a tuple of 1 to {MOST_ITEMS} parts of a scene")
         for i, item in enumerate(value):
-            check_part(get_args(hint)[0], item, f"{path}[{i}]")
+            check_part(get_args(hint)[0], item, f"{path}[{i}]", ranges)
     else:
-        check_part(hint, value, path)
+        check_part(hint, value, path, ranges)
 
 
-def check_part(kind: Any, value: Any, path: str) -> None:
+def check_part(kind: Any, value: Any, path: str, ranges: bool = True) -> None:
     """Raise BadKey unless a value is a record of a kind (None: any) with sound values."""
     if not dataclasses.is_dataclass(value) or (isinstance(kind, type) and not isinstance(value, kind)):
         name = kind.__name__ if isinstance(kind, type) else "part of a scene"
         raise refuse(path, _words(value), f"a {name}")
-    check_values(value, path)
+    check_values(value, path, ranges)
+
+
+def numbers(value: Any, interval: Range, path: str) -> np.ndarray | None:
+    """A number in internal units, or an array of them, in the unit of its range; None if it is traced.
+
+    Raises BadKey for what is none.
+    """
+    if isinstance(value, jax.core.Tracer):
+        return None
+    if isinstance(value, bool) or not isinstance(value, NUMBERS):
+        raise refuse(path, _words(value), str(interval))
+    try:
+        return np.asarray(value, float) / UNIT_FACTOR[interval.unit]
+    except (TypeError, ValueError, OverflowError):
+        raise refuse(path, _words(value), str(interval)) from None
 
 
 def check_quantity(value: Any, interval: Range, path: str) -> None:
     """Raise BadKey unless a number in internal units, or each item of an array, is in range."""
-    if isinstance(value, jax.core.Tracer):
+    known = numbers(value, interval, path)
+    if known is None:
         return
-    if isinstance(value, bool) or not isinstance(value, NUMBERS):
-        raise refuse(path, _words(value), str(interval))
-    try:
-        numbers = np.asarray(value, float) / UNIT_FACTOR[interval.unit]
-    except (TypeError, ValueError, OverflowError):
-        raise refuse(path, _words(value), str(interval)) from None
-    inside = (numbers > interval.lower) & (numbers < interval.upper)
+    lower, upper = _ends(interval)
+    inside = (known > lower) & (known < upper)
     for position in np.argwhere(~inside):
-        number = numbers[tuple(position)]
-        if not _contains(interval, float(number)):
-            where = path + "".join(f"[{i}]" for i in position)
-            raise refuse(where, _said(value, float(number)), str(interval))
+        where, number = path + "".join(f"[{i}]" for i in position), float(known[tuple(position)])
+        raise refuse(where, value if isinstance(value, int) and value == number else number, str(interval))
 
 
-def _contains(interval: Range, number: float) -> bool:
-    if interval.contains(number):
-        return True
-    ends = (interval.upper,) if interval.open_lower else (interval.lower, interval.upper)
-    return any(end != 0.0 and math.isclose(number, end, rel_tol=ROUNDING) for end in ends)
+def _ends(interval: Range) -> tuple[float, float]:
+    """Beyond the ends of a range, as far as differences may go."""
+    lower, upper = interval.lower, interval.upper
+    below = 0.0 if interval.open_lower else BEYOND * (abs(lower) or abs(upper))
+    return lower - below, upper + BEYOND * (abs(upper) or abs(lower))
 
 
 def _check_shape(value: Any, field: dataclasses.Field[Any], path: str) -> None:
@@ -95,11 +104,6 @@ def _check_shape(value: Any, field: dataclasses.Field[Any], path: str) -> None:
     if np.ndim(value) != int(field.metadata["many"]) or not 1 <= n <= MOST_ITEMS:
         expected = f"a list of 1 to {MOST_ITEMS} numbers" if field.metadata["many"] else "one number"
         raise refuse(path, f"array of shape {np.shape(value)}", expected)
-
-
-def _said(value: Any, number: float) -> Any:
-    """A number as it was written, where that is possible."""
-    return value if isinstance(value, int) and value == number else number
 
 
 def _words(value: Any) -> Any:

@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, Singular
 from jaxclamp.observe.figures import FIGURES, WHOLE
-from jaxclamp.scenes.address import changed, get
+from jaxclamp.scenes.address import get, replace
 from jaxclamp.scenes.scene import MeshSettings, Scene
 from jaxclamp.solve.clamping import clamp, inflate
 from jaxclamp.solve.results import Result
@@ -139,5 +139,5 @@ def _from_a_penalty(
 def multiplied(scene: Scene, paths: tuple[str, ...], factor: float) -> Scene:
     """A scene with the numbers at some addresses (of penalties, such as layers' bulk moduli) multiplied."""
     for path in paths:
-        scene = changed(scene, path, factor * get(scene, path))
+        scene = replace(scene, path, factor * get(scene, path))
     return scene

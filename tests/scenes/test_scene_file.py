@@ -21,7 +21,6 @@ from jaxclamp.core.records import concrete_subclasses, quantity, record, static
 from jaxclamp.fem.tube import build_tube, closed_radii
 from jaxclamp.observe.stops import OcclusionStop, TravelStop
 from jaxclamp.scenes import schema
-from jaxclamp.scenes.address import changed as set_to
 from jaxclamp.scenes.address import replace
 from jaxclamp.scenes.files import (
     dump_scene,
@@ -792,10 +791,10 @@ def test_constants_per_point_are_computable_and_cannot_be_written():
 
 def test_one_constant_that_is_not_finite_is_found():
     scene = per_point()
-    wrong = set_to(scene, "artery.layers[0].material.c[3][14]", math.nan)
+    wrong = replace(scene, "artery.layers[0].material.c[3][14]", math.nan)
     with pytest.raises(SceneError, match=r"artery\.layers\[0\]\.material\.c_kPa\[3\]\[14\] = nan: expected"):
         require_computable(wrong)
-    thin = set_to(scene, "artery.layers[1].thickness", np.full((1, 2), 0.0))
+    thin = replace(scene, "artery.layers[1].thickness", np.full((1, 2), 0.0))
     with pytest.raises(SceneError, match=r"layers\[1\]\.thickness_mm\[0\]\[0\] = 0\.0: expected"):
         require_computable(thin)
     require_computable(replace(scene, "artery.layers[0].material.k1", np.zeros((8, 150))))
