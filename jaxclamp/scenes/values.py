@@ -60,7 +60,7 @@ def check_part(kind: Any, value: Any, path: str, ranges: bool = True) -> None:
     """Raise BadKey unless a value is a record of a kind (None: any) with sound values."""
     if not dataclasses.is_dataclass(value) or (isinstance(kind, type) and not isinstance(value, kind)):
         name = kind.__name__ if isinstance(kind, type) else "part of a scene"
-        raise refuse(path, _words(value), f"a {name}")
+        raise refuse(path, _words(value), f"a record {name}")
     check_values(value, path, ranges)
 
 
@@ -71,12 +71,14 @@ def numbers(value: Any, interval: Range, path: str) -> np.ndarray | None:
     """
     if isinstance(value, jax.core.Tracer):
         return None
-    if isinstance(value, bool) or not isinstance(value, NUMBERS):
-        raise refuse(path, _words(value), str(interval))
     try:
-        return np.asarray(value, float) / UNIT_FACTOR[interval.unit]
-    except (TypeError, ValueError, OverflowError):
-        raise refuse(path, _words(value), str(interval)) from None
+        if not isinstance(value, bool) and isinstance(value, NUMBERS):
+            found = np.asarray(float(value) if isinstance(value, int) else value)
+            if found.dtype.kind in "iuf":
+                return found / UNIT_FACTOR[interval.unit]
+    except (TypeError, ValueError, OverflowError):  # lists of unlike lengths, digits in hundreds
+        pass
+    raise refuse(path, _words(value), str(interval))
 
 
 def check_quantity(value: Any, interval: Range, path: str) -> None:
