@@ -3,11 +3,15 @@
 Importing the package switches JAX to 64-bit floats: stresses near incompressibility need them.
 """
 
-import jax
+from jaxclamp.core.starting import guard_start
+
+guard_start()
+
+import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxclamp.core.failures import EquilibriumError, SceneError  # noqa: E402
+from jaxclamp.core.failures import EquilibriumError, Failure, SceneError, TooLittleMemory, Unfit, WorkerLost  # noqa: E402
 from jaxclamp.core.progress import Progress  # noqa: E402
 from jaxclamp.observe.figures import shown_in  # noqa: E402
 from jaxclamp.observe.measure import Measure  # noqa: E402
@@ -46,6 +50,7 @@ from jaxclamp.trust.estimates import with_errors  # noqa: E402
 __all__ = [
     "MEASURES",
     "EquilibriumError",
+    "Failure",
     "ForceStop",
     "Measure",
     "OcclusionStop",
@@ -53,7 +58,10 @@ __all__ = [
     "Result",
     "Scene",
     "SceneError",
+    "TooLittleMemory",
     "TravelStop",
+    "Unfit",
+    "WorkerLost",
     "axial_stress_at_P",
     "circumferential_stress_at_P",
     "clamp",

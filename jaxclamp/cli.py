@@ -1,7 +1,7 @@
 """The command line: `jaxclamp show`, `run`, `optimise`, `accuracy` and `presets`.
 
 Exit codes: 0 done; 2 the input is wrong; 3 no converged solution; 4 the machine refused; 130
-interrupted. What went wrong is one sentence on standard error. Results go to standard output,
+interrupted; 143 terminated. What went wrong is one sentence on standard error. Results go to standard output,
 progress and notes to standard error. Only what a command needs is imported, when it runs.
 """
 
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from jaxclamp.core.failures import Failure
+from jaxclamp.core.signals import INTERRUPTED, TERMINATED, Terminated, ending
 from jaxclamp.scenes.presets import KINDS, preset
 from jaxclamp.scenes.presets import presets as shipped
 from jaxclamp.show import console
@@ -25,7 +26,7 @@ from jaxclamp.show import console
 if TYPE_CHECKING:
     from jaxclamp.scenes.scene import Scene
 
-DONE, WRONG_INPUT, MACHINE_REFUSED, INTERRUPTED = 0, 2, 4, 130
+DONE, WRONG_INPUT, MACHINE_REFUSED = 0, 2, 4
 """exit codes; failures bring their own"""
 
 app = typer.Typer(
@@ -67,13 +68,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
+    given = None if arguments is None else list(arguments)
     try:
-        code = app(
-            args=None if arguments is None else list(arguments), prog_name="jaxclamp", standalone_mode=False
-        )
+        with ending():
+            code = app(args=given, prog_name="jaxclamp", standalone_mode=False)
         sys.stdout.flush()
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
+    except Terminated:
+        return _fail("terminated", TERMINATED)
     except (BrokenPipeError, SystemExit):  # the reader of our output has gone; typer exits for that
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
@@ -140,6 +143,9 @@ def show(
     quiet: QuietOption = False,
 ) -> None:
     """Check a scene and say what would be modelled; solves nothing."""
+    from jaxclamp.core.surroundings import use_cpu
+
+    use_cpu()
     loaded = _load(scene, fidelity, overrides, quiet)
     from jaxclamp.show.description import describe
 
@@ -259,7 +265,7 @@ def presets(
 
 
 def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:
-    from jaxclamp.scenes.fidelity import EXPECTED_ERRORS
+    from jaxclamp.scenes.fidelity import ERRORS_ON_HUMAN_LAD
     from jaxclamp.scenes.files import load_scene, own_mesh_keys
 
     loaded = load_scene(scene, overrides or (), fidelity or "standard")
@@ -269,15 +275,19 @@ def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: 
         keys = ", ".join(f"mesh.{key}" for key in own)
         typer.echo(f"note: {scene} sets {keys} itself; --fidelity {fidelity} leaves that as it is", err=True)
     else:
-        errors = ", ".join(f"{error:.1%} in the {name}" for name, error in EXPECTED_ERRORS[fidelity].items())
-        typer.echo(f"note: --fidelity {fidelity}: expect errors of about {errors}", err=True)
+        errors = ", ".join(
+            f"{error:.1%} in the {name}" for name, error in ERRORS_ON_HUMAN_LAD[fidelity].items()
+        )
+        said = f"on human-lad, errors of {errors}; those of this scene are estimated at the end"
+        typer.echo(f"note: --fidelity {fidelity}: {said}", err=True)
     return loaded
 
 
 def _check_folder(folder: Path) -> None:
     """Refuse a folder in which no file can be written; leaves nothing behind."""
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    missing: list[Path] = []
     try:
+        missing += [path for path in (folder, *folder.parents) if not path.exists()]
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):

@@ -46,8 +46,8 @@ def evaluate(
     `failure`, and no result.
     """
     design = np.asarray(design, float)
-    scene = problem.scene_at(design)
     try:
+        scene = problem.scene_at(design)
         require_possible(scene)
         result = clamp(scene, guess=near)
     except (EquilibriumError, SceneError) as error:

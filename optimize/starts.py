@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,16 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from jaxclamp import EquilibriumError, Progress, Result, Scene, SceneError, cores, require_possible
+from jaxclamp import (
+    EquilibriumError,
+    Progress,
+    Result,
+    Scene,
+    SceneError,
+    WorkerLost,
+    cores,
+    require_possible,
+)
 from optimize.drivers import METHODS, Enough
 from optimize.evaluator import Evaluator
 from optimize.journal import Journal
@@ -109,6 +118,17 @@ def elsewhere(
         ]
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def answer(other: Future[list[Evaluation]]) -> list[Evaluation]:
+    """What another start found. Raises WorkerLost if its process has ended."""
+    try:
+        return other.result()
+    except BrokenExecutor:
+        raise WorkerLost(
+            "the process of another start has ended, perhaps for lack of memory: what it found is kept, "
+            "continue with --resume"
+        ) from None
 
 
 def from_another_start(

@@ -22,7 +22,7 @@ from optimize.journal import Journal
 from optimize.problem import DesignProblem
 from optimize.record import Evaluation, Record
 from optimize.resuming import take_over
-from optimize.starts import Budget, drive, elsewhere
+from optimize.starts import Budget, answer, drive, elsewhere
 from optimize.verification import Verification, verify
 
 COLD_AGREES = 1e-4
@@ -125,7 +125,7 @@ def minimise(
             if others:
                 tell(Progress("optimising", 1.0, f"waiting for {len(others)} other starts"))
             for number, other in enumerate(others, 2):
-                record.evaluations += [dataclasses.replace(e, start=number) for e in other.result()]
+                record.evaluations += [dataclasses.replace(e, start=number) for e in answer(other)]
         study = finish(record, first, stopped, tell, check_finer_mesh, begun)
         if journal is not None:
             journal.write(study.to_dict(), record.rows())

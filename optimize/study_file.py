@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxclamp import Progress, Scene, SceneError, load_scene
+from jaxclamp import Failure, Progress, Scene, SceneError, load_scene
 from jaxclamp.scenes.address import describe
 from jaxclamp.scenes.files import read_text
 from jaxclamp.scenes.schema import shown, toml_value
+from jaxclamp.scenes.toml import parsed
 from jaxclamp.scenes.wording import did_you_mean, shortened
 from optimize.drivers import METHODS
 from optimize.named_measures import read_measure
@@ -76,9 +76,9 @@ def load_study(name_or_path: str | Path) -> StudyFile:
     """The study of a preset or a TOML file. Raises SceneError."""
     text, source = read_text(name_or_path, "study")
     try:
-        table = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise SceneError(f"{source}: not valid TOML: {' '.join(str(error).split())}") from None
+        table = parsed(text)
+    except Failure as error:
+        raise SceneError(f"{source}: {error}") from None
     try:
         return _study(table, Path(name_or_path).parent)
     except SceneError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from jaxclamp import EquilibriumError, Result, Scene, clamp, replace
+from jaxclamp import EquilibriumError, Result, Scene, SceneError, TooLittleMemory, clamp, replace
 from optimize.gains import Gain
 from optimize.problem import DesignProblem
 
@@ -61,7 +61,7 @@ class Verification:
     def sentence(self) -> str:
         """What came of it, for a reader."""
         if self.gain is None:
-            return f"the finer model has no equilibrium: {self.failure}"
+            return f"the finer model was not solved: {self.failure}"
         verdict = "the gain survives" if self.survives else "THE GAIN DOES NOT SURVIVE"
         if self.gain_before.difference <= 0.0:
             verdict = "there was no gain to lose"
@@ -92,7 +92,7 @@ def verify(problem: DesignProblem, results: dict[str, Result]) -> Verification:
     for name, result in results.items():
         try:
             found = clamp(finer(result.scene), guess=result)
-        except EquilibriumError as error:
+        except (EquilibriumError, SceneError, TooLittleMemory) as error:
             failure = f"{name}: {error}" if name in ("start", "best") else failure
             continue
         fine[name], final[name] = found.measure(problem.objective), found.final

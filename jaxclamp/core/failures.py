@@ -91,6 +91,24 @@ class Singular(Failure):
     exit_code = 3
 
 
+class Unfit(Failure):
+    """This process cannot compute, or would do so wrongly: JAX has no device, or other settings."""
+
+    exit_code = 4
+
+
+class TooLittleMemory(Failure):
+    """A scene needs more memory than this process may have."""
+
+    exit_code = 4
+
+
+class WorkerLost(Failure):
+    """The process that solves scenes for compiled programs has ended."""
+
+    exit_code = 4
+
+
 class NoReference(Failure):
     """The finer meshes have no solution to compare with."""
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import weakref
 from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
@@ -93,12 +94,35 @@ def static(default: Any = dataclasses.MISSING, choices: tuple[str, ...] = ()) ->
 def record(cls: type[Record]) -> type[Record]:
     """Make `cls` a frozen, keyword-only dataclass and a JAX pytree, with `==` that gives a bool."""
     frozen: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
-    frozen.__eq__, frozen.__hash__ = _equal, _hash
-    fields = dataclasses.fields(frozen)
+    frozen.__eq__, frozen.__hash__, frozen.__reduce__ = _equal, _hash, _reduce
+    _make_known(frozen)
+    return frozen
+
+
+_known: weakref.WeakSet[type] = weakref.WeakSet()
+"""the records that JAX of this process sees as pytrees"""
+
+
+def _make_known(cls: type[Any]) -> None:
+    """Have JAX see a record as a pytree."""
+    fields = dataclasses.fields(cls)
     meta = [f.name for f in fields if f.metadata.get("static")]
     data = [f.name for f in fields if not f.metadata.get("static")]
-    jax.tree_util.register_dataclass(frozen, data_fields=data, meta_fields=meta)
-    return frozen
+    jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=meta)
+    _known.add(cls)
+
+
+def _reduce(self: Any) -> tuple[Any, ...]:
+    """For pickle: the class with the values of its fields."""
+    return _rebuilt, (type(self), *(getattr(self, f.name) for f in dataclasses.fields(self)))
+
+
+def _rebuilt(cls: Any, *values: Any) -> Any:
+    """A record of a class that may have travelled itself, from a script of another process."""
+    if cls not in _known:
+        _make_known(cls)
+    names = (f.name for f in dataclasses.fields(cls))
+    return cls(**dict(zip(names, values, strict=True)))
 
 
 def _equal(self: Any, other: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from jaxclamp.core.surroundings import require_fit
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.units import combined
 
@@ -155,7 +156,8 @@ def _described(found: Any) -> str:
 
 
 def require_measure(found: Any) -> Measure:
-    """The measure, or a TypeError that says what to write instead."""
+    """The measure, or a TypeError that says what to write instead; Unfit if this process cannot compute."""
+    require_fit()
     if isinstance(found, Measure):
         return found
     raise TypeError(f"expected a measure, found {_described(found)}")

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxclamp.core.failures import BadAddress
+from jaxclamp.core.failures import BadAddress, BadKey, SceneError
 from jaxclamp.core.records import UNIT_FACTOR, Range
 from jaxclamp.scenes.schema import file_key, in_file_unit
+from jaxclamp.scenes.values import check_part, check_value, hints_of, numbers
 from jaxclamp.scenes.wording import did_you_mean, shortened
 
 LONGEST = 300
@@ -99,13 +100,45 @@ def replace(scene: Any, address: str, value: Any) -> Any:
     value: in internal units (mm, kPa, mN, radians), or in the unit that the address names ("stop.force_N");
     it may be traced. An item of an array ("clamp.jaw.slopes[1]") makes the array one of JAX.
 
-    Raises BadAddress, a SceneError and a KeyError, if there is no such place.
+    Raises BadAddress, a SceneError and a KeyError, if there is no such place, and SceneError for a value of a
+    kind that cannot stand there. Ranges are seen when the scene is solved: gradients and directions are
+    scenes too, whose floats may have any value.
     """
     found = _find(scene, address)
-    changed = value if found.factor == 1.0 else value * found.factor
+    inside = _internal(value, found.factor)
+    try:
+        _check(found, inside)
+    except BadKey as error:
+        raise SceneError(str(error)) from None
+    return _put(found, inside)
+
+
+def _internal(value: Any, factor: float) -> Any:
+    """A value in internal units; what is no number is left as it is."""
+    return value if factor == 1.0 or isinstance(value, str | bool | None) else value * factor
+
+
+def _put(found: _Found, value: Any) -> Any:
+    """A copy of the scene with another value at a place."""
     for node, step in zip(reversed(found.nodes), reversed(found.steps), strict=True):
-        changed = _with(node, step, changed)
-    return changed
+        value = _with(node, step, value)
+    return value
+
+
+def _check(found: _Found, value: Any) -> None:
+    """Raise BadKey for a value of a kind that cannot stand at a place."""
+    last = max(i for i, step in enumerate(found.steps) if isinstance(step, str))
+    owner, name = found.nodes[last], found.steps[last]
+    field = next(f for f in dataclasses.fields(owner) if f.name == name)
+    hint = hints_of(type(owner)).get(field.name)
+    key = text((*found.steps[:last], file_key(field), *found.steps[last + 1 :]))
+    whole = last == len(found.steps) - 1
+    if "range" in field.metadata:
+        numbers(value, field.metadata["range"], key)
+    elif whole or field.metadata.get("static"):  # an item of a list of whole numbers is seen as a list
+        check_value(field, hint, value if whole else (value,), key, ranges=False)
+    else:
+        check_part(next(iter(get_args(hint)), None), value, key, ranges=False)
 
 
 def describe(scene: Any, address: str) -> Place:

@@ -6,14 +6,12 @@ is wrong with which key.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxclamp.core.failures import BadKey
-from jaxclamp.core.records import UNIT_FACTOR, Range
+from jaxclamp.core.records import UNIT_FACTOR
 from jaxclamp.physics.jaws import Spline
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.scene import Layer, Scene
@@ -56,49 +54,6 @@ def check(scene: Scene) -> None:
     )
     for one in checks:
         one(scene)
-
-
-def check_signs(record: Any, path: str = "") -> None:
-    """Every quantity, and every item of an array of them, is finite, and positive where it has to be.
-
-    Less than the ranges of a file: differences, and studies of one's own, may step over their ends.
-    """
-    for field in dataclasses.fields(record):
-        value, name = getattr(record, field.name), schema.join(path, schema.file_key(field))
-        if "range" in field.metadata:
-            _check_sign(value, field.metadata["range"], name)
-        for where, part in _parts(value, name):
-            if dataclasses.is_dataclass(part):
-                check_signs(part, where)
-
-
-def check_target(scene: Scene) -> None:
-    """The stop's target lies in its range: nothing is solved for one that does not."""
-    for key, field in schema.fields_by_key(type(scene.stop)).items():
-        interval = field.metadata["range"]
-        value = float(getattr(scene.stop, field.name)) / UNIT_FACTOR[interval.unit]
-        slack = 1e-9 * (abs(interval.lower) + abs(interval.upper))
-        if not interval.lower - slack <= value <= interval.upper + slack:
-            raise refuse(f"stop.{key}", value, str(interval))
-
-
-def _parts(value: Any, name: str) -> list[tuple[str, Any]]:
-    """A value, or the items of a tuple, with their names."""
-    if isinstance(value, tuple):
-        return [(f"{name}[{i}]", part) for i, part in enumerate(value)]
-    return [(name, value)]
-
-
-def _check_sign(value: Any, interval: Range, name: str) -> None:
-    """A number in internal units, or an array of them (any shape), is finite and positive if it has to be."""
-    if not isinstance(value, int | float | list | tuple | np.number | np.ndarray | jax.Array):
-        raise refuse(name, value if isinstance(value, str) else repr(value), str(interval))
-    numbers = np.asarray(value, float)
-    positive = interval.open_lower and interval.lower == 0.0
-    wrong = ~np.isfinite(numbers) | (positive & ~(numbers > 0.0))
-    for position in np.argwhere(wrong):
-        where = name + "".join(f"[{i}]" for i in position)
-        raise refuse(where, float(numbers[tuple(position)]) / UNIT_FACTOR[interval.unit], str(interval))
 
 
 def check_names(scene: Scene) -> None:

@@ -8,21 +8,23 @@ ends as a `SceneError`, one sentence.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from jaxclamp.core.failures import BadKey, SceneError
+from jaxclamp.core.surroundings import require_fit
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.scenes import schema
-from jaxclamp.scenes.checks import check, check_mesh, check_signs, check_target
+from jaxclamp.scenes.checks import check
 from jaxclamp.scenes.fidelity import COUNTS, FIDELITIES, mesh_for
 from jaxclamp.scenes.overrides import apply_override
 from jaxclamp.scenes.presets import preset
 from jaxclamp.scenes.scene import Artery, Scene
 from jaxclamp.scenes.schema import refuse
+from jaxclamp.scenes.toml import parsed
+from jaxclamp.scenes.values import check_values
 from jaxclamp.scenes.wording import shortened
 
 LARGEST_FILE = 1_000_000
@@ -76,24 +78,23 @@ def require_possible(scene: Scene) -> None:
 
 
 def require_scene(found: Any) -> None:
-    """Raise TypeError for what is no scene."""
+    """Raise TypeError for what is no scene, Unfit if this process cannot compute."""
+    require_fit()
     if not isinstance(found, Scene):
         said = shortened(repr(found))
         raise TypeError(f"expected a scene, such as jaxclamp.load_scene('human-lad'), found {said}")
 
 
 def require_computable(scene: Scene) -> None:
-    """Refuse what cannot be solved: no scene, a number that is none, not finite, or not positive where it
-    has to be, a target out of its range, counts of elements that do not fit the layers.
+    """Refuse what a file with the same values would be refused for, and what is no scene.
 
-    Less than `require_possible`: differences may step over the ends of ranges. Raises TypeError for what is
+    Unlike `require_possible`, a material's constants may be arrays over points. Raises TypeError for what is
     no scene, SceneError for the rest.
     """
     require_scene(scene)
     with _refusals("scene"):
-        check_signs(scene)
-        check_target(scene)
-        check_mesh(scene)
+        check_values(scene)
+        check(scene)
 
 
 @contextmanager
@@ -138,10 +139,8 @@ def read_text(name_or_path: str | Path, kind: str = "scene") -> tuple[str, str]:
 
 
 def _parsed(text: str, source: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise SceneError(f"{source}: not valid TOML: {' '.join(str(error).split())}") from None
+    with _refusals(source):
+        return parsed(text)
 
 
 def _expand(table: dict[str, Any], source: str) -> None:
@@ -155,7 +154,7 @@ def _expand(table: dict[str, Any], source: str) -> None:
         if isinstance(name, str):
             where = key if kind == "artery" else f"clamp.{key}"
             try:
-                owner[key] = tomllib.loads(preset(name, kind).text)
+                owner[key] = parsed(preset(name, kind).text)
             except SceneError as error:
                 raise SceneError(f"{source}: {where} = {schema.shown(name)}: {error}") from None
 

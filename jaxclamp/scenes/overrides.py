@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from itertools import pairwise
 from typing import Any
 
-from jaxclamp.core.failures import BadAddress, SceneError
+from jaxclamp.core.failures import BadAddress, BadKey, SceneError
 from jaxclamp.core.records import concrete_subclasses
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.address import Step, steps
 from jaxclamp.scenes.scene import Stop
+from jaxclamp.scenes.toml import parsed
 from jaxclamp.scenes.wording import did_you_mean, shortened
 
 
@@ -76,10 +76,10 @@ def _inside(node: Any, step: Step, place: str) -> Any:
 def _value(text: str, said: str) -> Any:
     """A TOML value; a bare word is a string."""
     try:
-        parsed = tomllib.loads(f"value = {text}")
-        if parsed.keys() == {"value"}:
-            return parsed["value"]
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
+        table = parsed(f"value = {text}")
+        if table.keys() == {"value"}:
+            return table["value"]
+    except BadKey:
         if re.fullmatch(r"\w[\w.+-]*", text):
             return text
     raise SceneError(f'{said}: expected a number, a word, a "text", a [list] or a {{ table }} after the =')

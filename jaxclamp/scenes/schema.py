@@ -197,7 +197,7 @@ def _read_field(field: dataclasses.Field[Any], hint: Any, value: Any, path: str)
             return np.array([_quantity(item, interval, f"{path}[{i}]") for i, item in enumerate(items)])
         return _quantity(value, interval, path)
     if field.metadata.get("static"):
-        return _static(field, hint, value, path)
+        return check_static(field, hint, value, path)
     if get_origin(hint) is tuple:
         inner = get_args(hint)[0]
         items = _items(value, path, "a list of tables")
@@ -240,7 +240,8 @@ def _static_wanted(field: dataclasses.Field[Any], hint: Any) -> str:
     return "a whole number" if hint is int else "a number"
 
 
-def _static(field: dataclasses.Field[Any], hint: Any, value: Any, path: str) -> Any:
+def check_static(field: dataclasses.Field[Any], hint: Any, value: Any, path: str) -> Any:
+    """A choice of a file (a list for a tuple) as the record holds it. Raises BadKey."""
     expected = _static_wanted(field, hint)
     if get_origin(hint) is tuple:
         items = _items(value, path, expected)

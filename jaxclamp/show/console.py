@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,12 @@ def progress(quiet: bool) -> Iterator[Callable[[Any], None] | bool]:
 
     A bar on a terminal, plain lines elsewhere, both on standard error; False if quiet.
     """
+    with cache_in_a_line(quiet), _progress(quiet) as tell:
+        yield tell
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[Any], None] | bool]:
     if quiet:
         yield False
     elif not sys.stderr.isatty():
@@ -44,6 +53,40 @@ def progress(quiet: bool) -> Iterator[Callable[[Any], None] | bool]:
                 bars.update(tasks[event.stage], completed=event.fraction, said=event.message)
 
             yield draw
+
+
+DAMAGED_CACHE = "Error reading persistent compilation cache entry"
+"""how JAX begins the warning that it gives for each of its compiled programs that it cannot read"""
+
+
+@contextmanager
+def cache_in_a_line(quiet: bool) -> Iterator[None]:
+    """Have JAX's warnings of a damaged compilation cache make one line of this process, none if quiet.
+
+    Processes that are started meanwhile say nothing of it.
+    """
+    before, others = os.environ.get("PYTHONWARNINGS", ""), warnings.showwarning
+
+    def show(message: Any, *about: Any, **more: Any) -> None:
+        if not str(message).startswith(DAMAGED_CACHE):
+            others(message, *about, **more)
+        elif not quiet:
+            _tell_of_cache()
+
+    os.environ["PYTHONWARNINGS"] = f"{before},ignore:{DAMAGED_CACHE}".removeprefix(",")
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("always", message=DAMAGED_CACHE)
+            warnings.showwarning = show
+            yield
+    finally:
+        os.environ["PYTHONWARNINGS"] = before
+
+
+@cache
+def _tell_of_cache() -> None:
+    """Once in a process."""
+    sys.stderr.write("note: JAX's compilation cache is damaged: programs are compiled anew; empty it\n")
 
 
 class PlainLines:

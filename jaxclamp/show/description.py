@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from jaxclamp.fem.symmetry import symmetry_of
-from jaxclamp.fem.tube import axial_fractions, build_tube, end_height, supports
+from jaxclamp.fem.tube import axial_fractions, build_tube, end_height
 from jaxclamp.potential.terms import needed
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.linear_solvers import available
+from jaxclamp.solve.memory import predicted_MB, unknowns_of
 
 USUAL_ITERATIONS = 90
 """Newton iterations of a whole clamping, on any mesh"""
@@ -18,8 +19,6 @@ START_SECONDS = 8.0
 """compilation and output, s"""
 ITERATION_SECONDS, ITERATION_EXPONENT = 8.2e-7, 1.33
 """time of an iteration: factor times unknowns to the exponent, s (fitted to two meshes)"""
-START_MEMORY, MEMORY_PER_UNKNOWN = 500.0, 0.025
-"""MB: Python with the compiled programs, and what the factors add (the same two meshes)"""
 
 
 def describe(scene: Scene) -> dict[str, Any]:
@@ -28,7 +27,7 @@ def describe(scene: Scene) -> dict[str, Any]:
     `symmetry` is the modelled share of the artery, `modelled` says it in words.
     """
     symmetry, mesh, solver = symmetry_of(scene.mesh.symmetry), build_tube(scene.mesh), scene.solver
-    unknowns = int(np.sum(~supports(mesh, scene.mesh)))
+    unknowns = unknowns_of(scene.mesh)
     seconds = START_SECONDS + USUAL_ITERATIONS * ITERATION_SECONDS * unknowns**ITERATION_EXPONENT
     return {
         "symmetry": symmetry.share,
@@ -45,7 +44,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "continuation": solver.continuation,
         "linear_solver": available(unknowns)[0] if solver.linear_solver == "auto" else solver.linear_solver,
         "predicted_seconds": _rounded(seconds),
-        "predicted_memory_MB": _rounded(START_MEMORY + MEMORY_PER_UNKNOWN * unknowns),
+        "predicted_memory_MB": _rounded(predicted_MB(unknowns)),
         "warnings": warnings(scene),
     }
 

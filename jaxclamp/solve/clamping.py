@@ -16,6 +16,7 @@ from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.files import require_computable
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.linear_solvers import Factors
+from jaxclamp.solve.memory import require_memory, unknowns_of
 from jaxclamp.solve.results import Result, work_balance
 from jaxclamp.solve.stages import Clamping
 from jaxclamp.solve.warm import on_mesh_of, solve_warm
@@ -33,7 +34,9 @@ def clamp(
     progress: True for lines on standard error, or a function of `Progress`
 
     Raises EquilibriumError if the stop is not reached; its `result` keeps what did converge.
-    Raises SceneError for a number that is not finite, or not positive where it has to be.
+    Raises SceneError for what a scene file with the same values would be refused for, TooLittleMemory for a
+    mesh that does not fit into memory, Unfit for a process that cannot compute: with JAX's 64-bit floats
+    switched off, or forked from one that had used JAX (start processes by spawn).
     """
     return _solve(scene, guess, teller(progress), to_stop=True)
 
@@ -41,7 +44,7 @@ def clamp(
 def inflate(scene: Scene, *, guess: Result | None = None) -> Result:
     """The artery of a scene in the body: load-free and physiological states, no clamp.
 
-    Raises EquilibriumError, and SceneError as `clamp` does.
+    Raises EquilibriumError, and what `clamp` raises.
     """
     return _solve(scene, guess, teller(None), to_stop=False)
 
@@ -51,6 +54,8 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
     require_computable(scene)
     if to_stop:
         require_a_gap(scene)
+    if guess is None or guess.scene.mesh != scene.mesh:
+        require_memory(unknowns_of(scene.mesh))
     model = build_model(scene, None if guess is None else guess.model)
     attempt, every_term = None, False
     if guess is not None:

@@ -68,6 +68,12 @@ class Result:
     errors: dict[str, dict[str, float | None]] | None = None
     """how far the main figures may be off, see `jaxclamp.trust.estimates`; None if it was not asked for"""
 
+    def __repr__(self) -> str:
+        """What came of it, and whether it is known how far its figures may be off."""
+        reached = f"{len(self.states)} states" if self.converged else f"not converged, {self.failure}"
+        known = "not estimated, see jaxclamp.with_errors" if self.errors is None else "in .errors"
+        return f"<Result of {self.scene.title!r}: {reached}; numerical errors: {known}>"
+
     def measure(self, measure: Measure) -> float:
         """The value of a measure in internal units (mm, kPa, mN, uJ), from the states at hand.
 

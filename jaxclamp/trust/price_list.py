@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
 
-from jaxclamp.core.failures import EquilibriumError, NoReference
+from jaxclamp.core.failures import EquilibriumError, NoReference, SceneError, TooLittleMemory
 from jaxclamp.core.progress import Progress
 from jaxclamp.fem.landmarks import layer_of_P
 from jaxclamp.observe.measures import smooth_peak_axial_stress
@@ -154,7 +154,7 @@ def solve(rung: Rung) -> Price:
         start = time.perf_counter()
         result = clamp(rung.scene)
         seconds = time.perf_counter() - start
-    except EquilibriumError as error:
+    except (EquilibriumError, SceneError, TooLittleMemory) as error:
         return Price(rung.group, rung.setting, None, str(error))
     memory = result.cost["peak_memory_MB"]
     found: dict[str, float] | None = figures(result) | {GRADIENT: slope_by_jaw_size(result)}

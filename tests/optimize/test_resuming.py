@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from jaxclamp.cli import main
 from optimize.journal import Journal, write_whole
 from optimize.record import Evaluation, Record
 from optimize.resuming import take_over
-from optimize.starts import Budget, from_another_start
+from optimize.starts import Budget, answer, from_another_start
 from optimize.study_file import StudyFile, load_study
 
 STUDY = """
@@ -188,6 +190,13 @@ def test_damage_of_another_start_is_no_silence(asked, tmp_path):
     write_whole(tmp_path / "start-2" / "study.json", json.dumps(content))
     with pytest.raises(jc.SceneError, match="start-2"):
         from_another_start(asked.problem, Budget(asked.method, 3, 1e-4), tmp_path / "start-2", resume=True)
+
+
+def test_a_lost_process_of_another_start_is_one_sentence():
+    lost: Future = Future()
+    lost.set_exception(BrokenProcessPool("terminated abruptly"))
+    with pytest.raises(jc.WorkerLost, match="what it found is kept, continue with --resume"):
+        answer(lost)
 
 
 @pytest.mark.parametrize(

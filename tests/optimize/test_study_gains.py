@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import types
+
 import pytest
 
+import jaxclamp as jc
 from optimize.gains import Gain
-from optimize.verification import Verification
+from optimize.verification import Verification, verify
 
 
 def verification(coarse, fine, unit="kPa"):
@@ -50,6 +53,20 @@ def test_a_finer_model_without_equilibrium_has_no_gain():
     found = verification((4.0, 3.0), (None, 2.0))
     said = found.to_dict()
     assert (said["gain"], said["gain_difference"], said["survives"]) == (None, None, False)
+
+
+@pytest.mark.parametrize("error", [jc.TooLittleMemory("it needs 9 GB"), jc.SceneError("it is too stiff")])
+def test_a_finer_model_that_cannot_be_solved_leaves_the_study(error, monkeypatch):
+    """Stand-ins for results: each has a scene and a value."""
+
+    def clamp(scene, *, guess=None):
+        raise error
+
+    monkeypatch.setattr("optimize.verification.clamp", clamp)
+    result = types.SimpleNamespace(scene=jc.load_scene("human-lad"), measure=lambda measure: 3.0)
+    problem = types.SimpleNamespace(objective=jc.clamp_force())
+    found = verify(problem, {"start": result, "best": result})
+    assert found.sentence == f"the finer model was not solved: best: {error}"
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,11 @@ import errno
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import types
+import warnings
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,8 @@ from jaxclamp.cli import main
 from jaxclamp.core.failures import EquilibriumError, NoReference, NotConverged, SceneError
 from jaxclamp.scenes.fidelity import mesh_for
 from jaxclamp.scenes.presets import presets
+from jaxclamp.show import console
+from jaxclamp.show import export as real_export
 
 FIGURES = {
     "title": "Human LAD",
@@ -157,7 +161,8 @@ def test_run_passes_overrides_and_fidelity_on(engine, capsys):
     (scene,) = engine.scenes
     assert (scene.clamp.jaw.radius, scene.stop.travel) == (1.5, 2.0)
     assert scene.mesh == mesh_for("draft", scene.artery)
-    assert "note: --fidelity draft: expect errors of about" in err
+    assert "note: --fidelity draft: on human-lad, errors of 4.0% in the" in err
+    assert "those of this scene are estimated at the end" in err
     assert "% in the jaw force" in err
 
 
@@ -282,6 +287,43 @@ def test_an_interruption_is_exit_130_on_one_line(engine, capsys):
     assert err.strip() == "jaxclamp: interrupted"
 
 
+def test_termination_leaves_nothing_half_written(engine, capsys, tmp_path, monkeypatch):
+    def write_half(result, folder, tell):
+        (folder / "half.json").write_text("{")
+        os.kill(os.getpid(), signal.SIGTERM)
+        yield folder / "half.json"
+
+    monkeypatch.setattr(real_export, "_write_all", write_half)
+    engine.write_outputs = real_export.write_outputs
+    sys.modules["jaxclamp.show.export"].write_outputs = real_export.write_outputs
+    code, out, err = call(capsys, "run", "human-lad", "--quiet")
+    assert (code, out, err) == (143, "", "jaxclamp: terminated\n")
+    assert everything_below(tmp_path) == []
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_an_interruption_while_packages_are_imported_is_exit_130_on_one_line(tmp_path):
+    """JAX is on its way, as soon as the package is found."""
+    (tmp_path / "jax.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    done = command("show", "human-lad", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "jaxclamp: interrupted\n")
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_damaged_compilation_cache_is_one_line(engine, capsys, quiet, recwarn):
+    def clamp(scene, *, guess=None, progress=None):
+        for name in ("jit_stage", "jit_other"):
+            warnings.warn(f"Error reading persistent compilation cache entry for '{name}': ...", stacklevel=1)
+        return engine.outcome
+
+    console._tell_of_cache.cache_clear()
+    sys.modules["jaxclamp.solve.clamping"].clamp = clamp
+    code, _, err = call(capsys, "run", "human-lad", *(["--quiet"] if quiet else []))
+    assert (code, len(recwarn)) == (0, 0)
+    said = [line for line in err.splitlines() if "cache" in line]
+    assert len(said) == (0 if quiet else 1)
+
+
 def test_a_mistake_of_the_program_is_not_hidden(engine, capsys):
     engine.outcome = ZeroDivisionError("a bug")
     with pytest.raises(ZeroDivisionError):
@@ -301,6 +343,7 @@ WRONG = {
     "unknown fidelity": (["run", "human-lad", "--fidelity", "fine"], "draft, standard, reference"),
     "file for a folder": (["run", "human-lad", "--out", "file"], "'file'"),
     "file in the path": (["run", "human-lad", "--out", "file/a/b"], "'file/a/b'"),
+    "long path": (["run", "human-lad", "--out", "a" * 300], "--out"),
     "null in the path": (["run", "human-lad", "--out", "a\0b"], "--out"),
     "no scene": (["run"], "SCENE"),
     "unknown option": (["run", "human-lad", "--jsn"], "--jsn"),

@@ -435,6 +435,19 @@ def test_figures_leave_matplotlib_alone(result):
     assert not _pylab_helpers.Gcf.figs
 
 
+@pytest.mark.parametrize("name", FIGURES)
+def test_long_names_of_layers_leave_a_figure_its_room(result, name):
+    """Names of 200 characters are cut: nothing is pushed aside, and no warning (an error here) is given."""
+    scene = result.scene
+    for i in range(2):
+        scene = jc.replace(scene, f"artery.layers[{i}].name", str(i) * 200)
+    renamed = dataclasses.replace(result, model=dataclasses.replace(result.model, scene=scene))
+    images = [_pixels(getattr(r, f"plot_{name}")()) for r in (result, renamed)]
+    assert images[0].shape == images[1].shape
+    inked = [np.ptp(np.nonzero((image[..., :3] < 128).any(axis=-1))[1]) for image in images]
+    assert inked[1] > 0.9 * inked[0]
+
+
 class Page(HTMLParser):
     """Tags in order, and links to anything."""
 

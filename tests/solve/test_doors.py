@@ -16,6 +16,7 @@ import jaxclamp as jc
 from jaxclamp.core import failures
 from jaxclamp.core.records import quantity, record, static
 from jaxclamp.physics.jaws import Jaw
+from jaxclamp.scenes.files import require_computable
 from jaxclamp.solve.clamping import inflate
 
 SMALL = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[1, 1]", "stop.occlusion=0.6"]
@@ -57,6 +58,87 @@ def test_a_factory_is_no_measure():
 def test_what_cannot_be_solved_is_refused_at_once(path, value, said):
     with pytest.raises(jc.SceneError, match=said):
         jc.clamp(jc.replace(small(), path, value))
+
+
+IMPOSSIBLE = {
+    "artery.pressure_kPa": 2e4,
+    "artery.length_mm": 0.01,
+    "artery.layers[0].opening_angle_deg": 340.0,
+    "artery.layers[0].material.c_kPa": 1e12,
+    "artery.layers[1].thickness_mm": 300.0,
+    "artery.layers[1].name": "media",
+    "clamp.jaw.radius_mm": 1e9,
+    "contact.smoothing_mm": 5.0,
+    "mesh.axial": 1,
+    "mesh.radial": [1],
+    "mesh.element": "q9",
+    "mesh.axial_grading": "steep",
+    "solver.tolerance": 0.5,
+    "solver.continuation": "luman",
+    "stop.occlusion": 92.5,
+}
+"""single keys with which the small scene makes no sense, by itself or beside the others"""
+PYTHON_DOORS = {
+    "clamp": jc.clamp,
+    "inflate": inflate,
+    "evaluate": lambda s: jc.evaluate(s, jc.clamp_force()),
+}
+
+
+@pytest.mark.parametrize("door", PYTHON_DOORS)
+@pytest.mark.parametrize("key", IMPOSSIBLE)
+def test_python_says_what_a_scene_file_says(key, door):
+    value = IMPOSSIBLE[key]
+    with pytest.raises(jc.SceneError) as of_file:
+        small(f"{key}={value}")
+    with pytest.raises(jc.SceneError) as of_python:
+        PYTHON_DOORS[door](jc.replace(small(), key, tuple(value) if isinstance(value, list) else value))
+    said = str(of_file.value).removeprefix("human-lad with overrides: ")
+    assert str(of_python.value).removeprefix("scene: ") == said
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("artery", "human-lad-wall", r'artery = "human-lad-wall": expected a record Artery'),
+        ("clamp.jaw", 3.0, r"clamp\.jaw = 3\.0: expected a record Jaw"),
+        ("artery.layers", [], r"artery\.layers = .*: expected a tuple of 1 to 200"),
+        ("artery.layers[0]", None, r"artery\.layers\[0\] = .*None.*: expected a record Layer"),
+        ("artery.layers[0].material.c", True, r"c_kPa = true: expected a number"),
+        ("clamp.jaw.radius", [1.0, "2"], r"clamp\.jaw\.radius_mm = .*: expected a number"),
+        ("mesh.radial[1]", 0.5, r"mesh\.radial\[1\] = .*: expected a list of whole numbers"),
+    ],
+)
+def test_what_is_of_another_kind_is_refused_when_it_is_set(path, value, said):
+    with pytest.raises(jc.SceneError, match=said):
+        jc.replace(small(), path, value)
+
+
+def test_an_array_where_a_scene_has_one_number_is_refused():
+    with pytest.raises(jc.SceneError, match=r"radius_mm = .*shape \(2,\).*: expected one number"):
+        jc.clamp(jc.replace(small(), "clamp.jaw.radius", np.array([1.0, 2.0])))
+
+
+def test_directions_and_gradients_are_scenes_with_any_numbers():
+    assert jc.replace(small(), "stop.occlusion", -3.0).stop.occlusion == -3.0
+
+
+def test_differences_may_step_over_the_end_of_a_range():
+    """By a millionth: the slope by a pressure of 0 can be had by central differences."""
+    require_computable(jc.replace(small(), "artery.pressure", -1e-3))
+    with pytest.raises(jc.SceneError, match=r"pressure_kPa = -0\.1: expected a number at least 0 kPa"):
+        require_computable(jc.replace(small(), "artery.pressure", -0.1))
+    with pytest.raises(jc.SceneError, match=r"thickness_mm = -1e-12: expected a number greater than 0"):
+        require_computable(jc.replace(small(), "artery.layers[0].thickness", -1e-12))
+
+
+def test_a_result_says_how_to_get_its_errors():
+    result = jc.clamp(small())
+    assert repr(result) == (
+        f"<Result of 'Human LAD between two cylinders': {len(result.states)} states; "
+        "numerical errors: not estimated, see jaxclamp.with_errors>"
+    )
+    assert repr(dataclasses.replace(result, errors={})).endswith("numerical errors: in .errors>")
 
 
 @record

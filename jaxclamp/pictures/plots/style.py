@@ -12,6 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from jaxclamp.scenes.wording import shortened
+
 INK, FAINT, RULE = "#1d2733", "#5b6673", "#d5dae0"
 LAYERS = ("#e8a08c", "#8fb4d6", "#e5cf86", "#9cc7a4", "#bda6cf")
 """fills of the layers, from inside to outside (pale: lines and letters go on top)"""
@@ -21,6 +23,8 @@ AXIAL, CIRCUMFERENTIAL, THIRD = "#d55e00", "#0072b2", "#009e73"
 """vermilion, blue and green of Okabe and Ito: told apart with any kind of colour vision"""
 
 SMALL, NORMAL, LARGE = 8.0, 9.0, 10.5
+LONGEST_NAME = 28
+"""characters of a layer's name in a figure"""
 DOTS_PER_INCH = 200
 
 
@@ -94,5 +98,5 @@ def letters(count: int) -> list[str]:
 
 
 def plain(name: str) -> str:
-    """A user's name as text: no mathematics between dollar signs, and not hidden from legends."""
-    return name.replace("$", r"\$").lstrip("_") or "layer"
+    """A user's name as text: not too long, no mathematics between dollar signs, not hidden from legends."""
+    return shortened(name, LONGEST_NAME).replace("$", r"\$").lstrip("_") or "layer"
