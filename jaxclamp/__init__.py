@@ -41,13 +41,15 @@ from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
 from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
 from jaxclamp.solve.linear_solvers import cores  # noqa: E402
 from jaxclamp.solve.results import versions  # noqa: E402
-from jaxclamp.trust.estimates import with_errors  # noqa: E402
+from jaxclamp.trust.estimates import Estimate, Neighbours, neighbours, with_errors  # noqa: E402
 
 __all__ = [
     "MEASURES",
     "EquilibriumError",
+    "Estimate",
     "ForceStop",
     "Measure",
+    "Neighbours",
     "OcclusionStop",
     "Progress",
     "Result",
@@ -70,6 +72,7 @@ __all__ = [
     "lumen_height",
     "lumen_width",
     "mean_contact_pressure",
+    "neighbours",
     "physiological_lumen_radius",
     "replace",
     "require_possible",
