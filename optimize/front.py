@@ -2,7 +2,8 @@
 
 The ends are the designs of least first and of least second objective. In between the first is minimised
 under limits on the second, evenly spread between its values at the ends (epsilon-constraints). Every point
-is a search of its own with its own journal, begun at the design found before, from its solution.
+is a search of its own with its own journal, begun at the best design that the searches before it have met,
+and solved from the nearest of theirs.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from jaxclamp import EquilibriumError, Measure, Progress, Result, SceneError, cl
 from optimize.journal import Journal
 from optimize.named_measures import in_words
 from optimize.problem import Constraint, DesignProblem
-from optimize.record import FEASIBLE, Record
+from optimize.record import FEASIBLE, Evaluation, Record
 from optimize.resuming import take_over
 from optimize.starts import Budget, drive
 from optimize.study import found_cold, require_solvable, with_bounds
@@ -142,13 +143,13 @@ def front(
     solution, OSError if the folder cannot be written.
     """
     begun, tell = time.perf_counter(), progress or (lambda event: None)
-    require_solvable(_limited(problem, second, None), budget.method)
+    require_solvable(limited(problem, second, None), budget.method)
     journal = Journal(folder, resume)
     try:
         if journal.found is not None and "front" not in journal.found:
             raise SceneError(f"{journal.path}: the study in that folder is another one, of one objective")
         bounded, reference = with_bounds(problem, tell)
-        points = _points(bounded, second, count, _Searches(budget, folder, resume, tell))
+        points = _Searches(bounded, second, budget, folder, resume, tell).points(count)
         if reference is None and problem.reference is not None:
             reference = _clamped(problem.reference)
         solved = {"start": _clamped(problem.scene), "reference": reference}
@@ -164,18 +165,6 @@ def front(
         journal.close()
 
 
-def _points(problem: DesignProblem, second: Measure, count: int, searches: _Searches) -> tuple[Point, ...]:
-    """From the least first objective to the least second one."""
-    begin = searches.point(1, _limited(problem, second, None), None)
-    swapped = _limited(dataclasses.replace(problem, objective=second), problem.objective, None)
-    end = searches.point(count, swapped, None, begin)
-    end = dataclasses.replace(end, values=end.values[::-1])
-    points = [begin]
-    for limit in np.linspace(begin.values[1], end.values[1], count)[1:-1].tolist():
-        points.append(searches.point(len(points) + 1, _limited(problem, second, limit), limit, points[-1]))
-    return (*points, end)
-
-
 def _clamped(scene: Any) -> Result | None:
     """The scene's solution; None if it has none."""
     try:
@@ -184,55 +173,76 @@ def _clamped(scene: Any) -> Result | None:
         return None
 
 
-def _limited(problem: DesignProblem, second: Measure, limit: float | None) -> DesignProblem:
-    """The problem with a limit on the second objective, which is measured in any case."""
-    limits = Constraint(second) if limit is None else Constraint(second, upper=limit)
-    return dataclasses.replace(problem, constraints=(limits, *problem.constraints))
-
-
-@dataclasses.dataclass(frozen=True)
 class _Searches:
-    """How the points of a front are found."""
+    """The searches of a front, each begun at the best design known by then."""
 
-    budget: Budget
-    folder: Path
-    resume: bool
-    tell: Callable[[Progress], Any]
+    def __init__(
+        self,
+        problem: DesignProblem,
+        second: Measure,
+        budget: Budget,
+        folder: Path,
+        resume: bool,
+        tell: Callable[[Progress], Any],
+    ) -> None:
+        self.problem, self.second, self.budget, self.folder = problem, second, budget, folder
+        self.resume, self.tell = resume, tell
+        self.known: list[Evaluation] = []
+        """of all searches; values: first and second objective, then what is constrained"""
+        self.solved: list[tuple[np.ndarray, Result]] = []
+        """the designs of the points, and their solutions"""
 
-    def point(
-        self, number: int, problem: DesignProblem, limit: float | None, before: Point | None = None
-    ) -> Point:
-        """The best design of a problem, from the one found before on.
+    def points(self, count: int) -> tuple[Point, ...]:
+        """From the least first objective to the least second one."""
+        begin, end = self._point(1, None), self._point(count, None, swapped=True)
+        limits = np.linspace(begin.values[1], end.values[1], count)[1:-1].tolist()
+        between = [self._point(number, limit) for number, limit in enumerate(limits, 2)]
+        return (begin, *between, end)
 
-        values: the problem's objective, then the measure of its first constraint
-        """
+    def _point(self, number: int, limit: float | None, swapped: bool = False) -> Point:
+        """The best design in the first objective for a limit on the second; swapped: in the second."""
         name = f"point-{number}"
+        problem = limited(self.problem, self.second, limit, swapped)
         self.tell(Progress(name, 0.0, f"minimising the {in_words(problem.objective)}"))
-        if before is not None:
-            problem = dataclasses.replace(problem, scene=problem.scene_at(before.design))
+        begin = Record(problem, self.budget.method, [_swapped(e, swapped) for e in self.known]).best()
+        near = None
+        if begin is not None:
+            problem = dataclasses.replace(problem, scene=problem.scene_at(begin.design))
+            near = min(self.solved, key=lambda known: float(np.max(np.abs(known[0] - begin.design))))
         record = Record(problem, self.budget.method, [])
         journal = Journal(self.folder / name, self.resume)
         heard = lambda event: self.tell(dataclasses.replace(event, stage=name))  # noqa: E731
         try:
             take_over(record, journal, heard)
-            warm = None if before is None else (problem.start, before.result)
-            _, stopped = drive(record, self.budget, journal, heard, warm)
+            _, stopped = drive(record, self.budget, journal, heard, near)
             best, result = found_cold(record, None)
-            journal.write(
-                record.to_dict(best=result.final, best_design=best.design, stopped_because=stopped),
-                record.rows(),
-            )
+            said = record.to_dict(best=result.final, best_design=best.design, stopped_because=stopped)
+            journal.write(said, record.rows())
         finally:
             journal.close()
         self.tell(Progress(name, 1.0, stopped))
-        values = float(best.values[0]), float(best.values[1])
-        return Point(
-            name,
-            limit,
-            best.design,
-            values,
-            best.violation(problem),
-            result,
-            len(record.evaluations),
-            stopped,
-        )
+        self.known += [_swapped(e, swapped) for e in record.evaluations]
+        self.solved.append((best.design, result))
+        first, second = _swapped(best, swapped).values[:2].tolist()
+        violation, count = best.violation(problem), len(record.evaluations)
+        return Point(name, limit, best.design, (first, second), violation, result, count, stopped)
+
+
+def _swapped(e: Evaluation, swapped: bool) -> Evaluation:
+    """An evaluation with its first two measures swapped, or as it is."""
+    if not swapped:
+        return e
+    order = [1, 0, *range(2, len(e.values))]
+    return dataclasses.replace(e, values=e.values[order], gradients=e.gradients[order])
+
+
+def limited(
+    problem: DesignProblem, second: Measure, limit: float | None, swapped: bool = False
+) -> DesignProblem:
+    """The problem with a limit on the second objective, which is measured in any case.
+
+    swapped: the second objective is minimised, and the first one is measured
+    """
+    first, other = (second, problem.objective) if swapped else (problem.objective, second)
+    limits = Constraint(other) if limit is None else Constraint(other, upper=limit)
+    return dataclasses.replace(problem, objective=first, constraints=(limits, *problem.constraints))

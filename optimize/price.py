@@ -60,6 +60,15 @@ class Change:
         """The same, lower being a gain."""
         return Gain(self.other.value, self.best.value, self.measure.unit, self.difference.error)
 
+    def said(self, other: str) -> str:
+        """In words; other: what the clamp compared with is called."""
+        gain, within = self.gain, ""
+        if self.word != WORSE and self.word != BETTER:
+            within = f", {self.word.removeprefix('same ')}"
+        share = f" ({gain.percentage})" if gain.percentage else ""
+        what = f"the {in_words(self.measure)} is {gain.amount} {gain.direction} than the {other}'s"
+        return f"{what}{share}{within}"
+
     def to_dict(self, other: str) -> dict[str, Any]:
         """A row of the table in study.json; other: what the clamp compared with is called."""
         found = self.difference
@@ -105,13 +114,18 @@ class Compared:
 
     @property
     def sentence(self) -> str:
-        """The price in one sentence: the measure that gets worst, relative to the other clamp's."""
-        worse = [change for change in self.price if change.word == WORSE]
-        if not worse:
-            return f"no other injury measure is higher than the {self.other}'s by more than its error"
-        worst = max(worse, key=lambda c: c.difference.value / (abs(c.other.value) or 1.0))
-        rest = f"; {len(worse) - 1} more of {len(self.price)} are higher, too" if len(worse) > 1 else ""
-        return f"the price: the {in_words(worst.measure)} is {worst.gain} than the {self.other}'s{rest}"
+        """The price in one sentence: what rises most, relative to the other clamp's, and what for certain."""
+        rank = lambda change: change.difference.value / (abs(change.other.value) or 1.0)  # noqa: E731
+        higher = sorted((c for c in self.price if c.difference.value > 0.0), key=rank, reverse=True)
+        certain = [change for change in higher if change.word == WORSE]
+        if not higher:
+            return f"no other injury measure is higher than the {self.other}'s"
+        said = f"the price: {higher[0].said(self.other)}"
+        if not certain:
+            return f"{said}; nothing is higher by more than its error"
+        if certain[0] is not higher[0]:
+            said += f"; beyond its error, {certain[0].said(self.other)}"
+        return said
 
     def value(self, name: str) -> str:
         """The objective of a clamp with its error and unit."""

@@ -144,7 +144,7 @@ def require_consistent(problem: DesignProblem) -> None:
         key = c.measure, c.relative
         lower, upper = found.get(key, (-math.inf, math.inf))
         found[key] = lower, upper = max(lower, c.lower), min(upper, c.upper)
-        if not lower <= upper:
+        if not (lower <= upper and c.lower <= c.upper):
             unit = " times the reference's" if c.relative else f" {c.measure.unit}".rstrip()
             raise SceneError(
                 f"the constraints on {c.measure} contradict each other: "
