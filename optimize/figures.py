@@ -198,14 +198,15 @@ def plot_convergence(study: Study) -> Picture:
     good = [(n, float(e.values[0])) for n, e in solved if e.violation(study.problem) <= FEASIBLE]
     bad = [(n, float(e.values[0])) for n, e in solved if e.violation(study.problem) > FEASIBLE]
     failed = [n + 1 for n, e in enumerate(study.evaluations) if e.failure is not None]
-    axes.plot(*np.transpose(good), "o", color=CIRCUMFERENTIAL, markersize=5, label="feasible")
+    if good:
+        axes.plot(*np.transpose(good), "o", color=CIRCUMFERENTIAL, markersize=5, label="feasible")
+        best = np.minimum.accumulate([value for _, value in good])
+        axes.step([n for n, _ in good], best, where="post", color=AXIAL, linewidth=1.8, label="best so far")
     if bad:
         axes.plot(
             *np.transpose(bad), "o", color=CIRCUMFERENTIAL, fillstyle="none", label="violates a constraint"
         )
-    best = np.minimum.accumulate([value for _, value in good])
-    axes.step([n for n, _ in good], best, where="post", color=AXIAL, linewidth=1.8, label="best so far")
-    values = [value for _, value in good]
+    values = [value for _, value in good or bad]
     low, high = min(values), max(values[0], float(np.median(values)))
     axes.set_ylim(low - 0.1 * (high - low or 1.0), high + 0.6 * (high - low or 1.0))
     if failed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from jaxclamp.pictures.fields import contact_along
 from jaxclamp.scenes.presets import presets as shipped
 from optimize import Constraint, DesignProblem, Variable
 from optimize.evaluator import Evaluator
-from optimize.figures import labelled
+from optimize.figures import labelled, plot_convergence
 from optimize.gains import Gain
 from optimize.named_measures import in_words
 from optimize.price import BETTER, SAME, UNKNOWN, WORSE, Change, Compared, injuries
@@ -149,6 +150,14 @@ def test_measures_in_words():
     assert labelled(PEAK) == "Smooth peak axial stress of the media, kPa"
     assert in_words(jc.volume_above("media", 20.0)) == "volume above 20 kPa of the media"
     assert in_words(jc.Measure("mine", "", lambda e: 0.0, ("a", 2.0))) == "mine(a, 2.0)"
+
+
+def test_convergence_is_drawn_without_a_feasible_design():
+    """A study may never meet its constraints, and still has a page."""
+    asked = problem(Constraint(FORCE, upper=1.0))
+    tried = [Evaluation(asked.start, np.array([v, 5.0]), np.zeros((2, 3)), 5) for v in (31.0, 30.0)]
+    axes = plot_convergence(SimpleNamespace(problem=asked, evaluations=tried)).axes[0]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["violates a constraint"]
 
 
 def test_the_contact_pressure_along_the_artery_has_the_reported_peak(pair):
