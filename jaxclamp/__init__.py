@@ -45,14 +45,16 @@ from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
 from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
 from jaxclamp.solve.linear_solvers import cores  # noqa: E402
 from jaxclamp.solve.results import versions  # noqa: E402
-from jaxclamp.trust.estimates import with_errors  # noqa: E402
+from jaxclamp.trust.estimates import Estimate, Neighbours, neighbours, with_errors  # noqa: E402
 
 __all__ = [
     "MEASURES",
     "EquilibriumError",
+    "Estimate",
     "Failure",
     "ForceStop",
     "Measure",
+    "Neighbours",
     "OcclusionStop",
     "Progress",
     "Result",
@@ -78,6 +80,7 @@ __all__ = [
     "lumen_height",
     "lumen_width",
     "mean_contact_pressure",
+    "neighbours",
     "physiological_lumen_radius",
     "replace",
     "require_possible",

@@ -195,7 +195,7 @@ def optimise(
     quiet: QuietOption = False,
 ) -> int:
     """Change the jaw's shape (or any floats of a scene) to lower an objective at the stop."""
-    from optimize.report import warning, write_study
+    from optimize.report import warning, write_found
     from optimize.study_file import load_study
 
     asked = load_study(study)
@@ -204,7 +204,7 @@ def optimise(
     with console.progress(quiet) as progress:
         tell = progress if callable(progress) else None
         found = asked.run(folder, resume, tell)
-        files = write_study(found, folder, asked.title, tell)
+        files = write_found(found, folder, asked.title, tell)
     if as_json:
         typer.echo(console.as_json(found.to_dict()))
     elif not quiet:

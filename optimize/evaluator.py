@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from jaxclamp import EquilibriumError, Progress, Result, SceneError, clamp, requ
 from jaxclamp import gradients as gradients_at
 from optimize.drivers import Enough, Target
 from optimize.journal import Journal
-from optimize.problem import Constraint, DesignProblem
+from optimize.problem import DesignProblem
 from optimize.record import Evaluation, Record
 
 FIRST_STEP = 0.1
@@ -65,6 +65,7 @@ class Evaluator:
     journal: where the record is kept on disk; None: nowhere
     most: evaluations on record at which it is `Enough`
     tell: hears of every evaluation
+    near: a design and its solution to start from, if there is one at hand
     """
 
     def __init__(
@@ -73,13 +74,14 @@ class Evaluator:
         journal: Journal | None,
         most: int,
         tell: Callable[[Progress], Any],
+        near: tuple[np.ndarray, Result] | None = None,
     ) -> None:
         self.record, self.journal, self.most, self.tell = record, journal, most, tell
         self.problem = record.problem
         self.lower, self.upper = self.problem.bounds
         self.width = self.upper - self.lower
         self.known = {e.design.tobytes(): e for e in record.evaluations}
-        self.near: list[tuple[np.ndarray, Result]] = []
+        self.near: list[tuple[np.ndarray, Result]] = [] if near is None else [near]
         """the designs solved last, and their solutions"""
         self.first: Result | None = None
         """the solution of the very first design, if that was not on record"""
@@ -115,7 +117,7 @@ class Evaluator:
             start=start,
             objective=partial(self._objective, scale),
             margins=self._margins,
-            n_margins=sum(1 for c in self.problem.constraints for _ in _sides(c)),
+            n_margins=len(self.problem.rises) + sum(len(c.sides) for c in self.problem.constraints),
             tolerance=tolerance * size / scale,
         )
 
@@ -138,13 +140,17 @@ class Evaluator:
 
     def _margins(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the constraints leave, relative to their bounds, and its derivatives by t."""
-        found = self.at(t)
+        problem, found = self.problem, self.at(t)
         if found.failure is not None:
             found = self._good()
-        values, slopes = [], []
-        rows = zip(self.problem.constraints, found.values[1:], found.gradients[1:], strict=True)
+        # linear in the design: known even where there is no equilibrium
+        design = self.lower + np.clip(np.asarray(t, float), 0.0, 1.0) * self.width
+        values = list(problem.climbs(design))
+        eye = np.eye(self.width.size)
+        slopes = [eye[b] - eye[a] * self.width[a] / self.width[b] for a, b in problem.rises]
+        rows = zip(problem.constraints, found.values[1:], found.gradients[1:], strict=True)
         for c, value, slope in rows:
-            for bound, sign in _sides(c):
+            for bound, sign in c.sides:
                 values.append(sign * (value - bound) / c.scale)
                 slopes.append(sign * slope * self.width / c.scale)
         return np.array(values), np.array(slopes).reshape(len(values), self.width.size)
@@ -180,15 +186,8 @@ class Evaluator:
             said = f"no equilibrium, backing off: {found.failure}"
         else:
             said = f"objective {found.values[0]:.5g} {unit}"
-            if self.problem.constraints:
+            if self.problem.constraints or self.problem.rises.size:
                 said += f", constraints violated by {found.violation(self.problem):.1%}"
         if best is not None:
             said += f", best {best.values[0]:.5g}"
         self.tell(Progress("optimising", count / self.most, f"{said}, at most {left:.0f} s left"))
-
-
-def _sides(c: Constraint) -> Iterator[tuple[float, float]]:
-    """The finite bounds of a constraint, each with the sign of its margin: sign (value - bound) >= 0."""
-    for bound, sign in ((c.lower, 1.0), (c.upper, -1.0)):
-        if math.isfinite(bound):
-            yield bound, sign

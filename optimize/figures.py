@@ -10,10 +10,17 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from jaxclamp import Result
-from jaxclamp.pictures.fields import layer_fields
+from jaxclamp import Measure, Result
+from jaxclamp.pictures.fields import LayerFields, contact_along, layer_fields
 from jaxclamp.pictures.plots import Plate
-from jaxclamp.pictures.plots.maps import FIELD, half_length_shown, load_free_angles, unrolled
+from jaxclamp.pictures.plots.maps import (
+    FIELD,
+    frame_of_map,
+    half_length_shown,
+    highest_through,
+    load_free_angles,
+    unrolled,
+)
 from jaxclamp.pictures.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
@@ -29,6 +36,7 @@ from jaxclamp.pictures.plots.style import (
     plain,
     stress_colours,
 )
+from optimize.named_measures import in_words
 from optimize.record import FEASIBLE
 from optimize.study import Study
 
@@ -39,6 +47,12 @@ def shown(study: Study) -> dict[str, Result]:
     """The clamps that a study compares, by name."""
     reference = {} if study.reference is None else {"reference": study.reference}
     return {**reference, "start": study.start, "best": study.best}
+
+
+def labelled(measure: Measure) -> str:
+    """A measure in words with its unit, as the label of an axis or a title."""
+    words = in_words(measure)
+    return f"{words[:1].upper()}{words[1:]}{f', {measure.unit}' if measure.unit else ''}"
 
 
 def profile(result: Result) -> tuple[np.ndarray, np.ndarray]:
@@ -61,13 +75,85 @@ def plot_profiles(study: Study) -> Picture:
     """The faces of the jaws along the artery, to scale."""
     figure = Picture(7.2, 3.0)
     axes = figure.add_subplot()
+    highest = 0.0
     for name, result in shown(study).items():
         z, y = profile(result)
+        highest = max(highest, float(np.nanmax(y)))
         axes.plot(z, y, color=COLOURS[name], linewidth=2.2 if name == "best" else 1.4, label=name)
     dress(axes, "position along the artery (mm)", "height (mm)", "Face of the upper jaw, to scale")
     axes.set_aspect("equal")
-    axes.set_ylim(-0.15, 2.2)
+    axes.set_ylim(-0.05 * highest, 1.05 * highest)
     legend(axes, loc="upper center", ncols=3)
+    return figure
+
+
+def plot_contact(study: Study) -> Picture:
+    """Contact pressure along the artery, the highest around it."""
+    figure = Picture(6.4, 3.4)
+    axes = figure.add_subplot()
+    for name, result in shown(study).items():
+        z, pressure = contact_along(result.model, result.states[-1].state)
+        axes.plot(z, pressure, color=COLOURS[name], linewidth=2.2 if name == "best" else 1.4, label=name)
+    reach = max(float(result.scene.clamp.jaw.half_extent()) for result in shown(study).values())
+    axes.set_xlim(-1.1 * reach, 1.1 * reach)
+    dress(axes, "position along the artery (mm)", "highest contact pressure (kPa)")
+    axes.set_ylim(bottom=0.0)
+    legend(axes)
+    return figure
+
+
+ANGLES, PLACES = 91, 201
+"""grid on which stress maps are compared, around and along the artery"""
+
+
+def _on_a_grid(layer: LayerFields, angles: np.ndarray, reach: float) -> np.ndarray:
+    """Highest axial stress through a layer over (place along the artery, angle), (PLACES, ANGLES), kPa."""
+    z, value = highest_through(layer)
+    places = np.linspace(-reach, reach, PLACES)
+    lines = np.stack([np.interp(places, *line) for line in zip(z.T, value.T, strict=True)], axis=1)
+    around = np.linspace(0.0, 180.0, ANGLES)
+    return np.stack([np.interp(around, angles, line) for line in lines])
+
+
+def plot_difference(study: Study) -> Picture:
+    """Axial stress of the best design less that of the clamp it is compared with, by layer."""
+    results = shown(study)
+    other = results[study.compared.other]
+    pair = [(r, layer_fields(r.model, r.states[-1].state)) for r in (study.best, other)]
+    reach = min(half_length_shown(r, layers) for r, layers in pair)
+    rows = len(study.best.scene.artery.layers)
+    maps = [
+        np.subtract(*[_on_a_grid(layers[row], load_free_angles(r, row), reach) for r, layers in pair])
+        for row in range(rows)
+    ]
+    size = nice_limits([np.abs(found) for found in maps], 5.0)[1]
+    figure = Picture(5.6, 2.7 * rows + 0.3)
+    grid = figure.subplots(rows, 1, squeeze=False, sharex=True)
+    for row, found in enumerate(maps):
+        axes: Axes = grid[row, 0]
+        drawn = axes.pcolormesh(
+            np.linspace(-reach, reach, PLACES),
+            np.linspace(0.0, 180.0, ANGLES),
+            found.T,
+            cmap="RdBu_r",
+            norm=Normalize(-size, size),
+            shading="gouraud",
+            rasterized=True,
+        )
+        frame_of_map(axes, reach)
+        last = row == rows - 1
+        name = plain(study.best.scene.artery.layers[row].name)
+        dress(
+            axes,
+            "position along the artery (mm)" if last else "",
+            "angle from the fold (deg)",
+            f"{name}: best less {study.compared.other}",
+            grid=False,
+        )
+    bar = figure.colorbar(drawn, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
+    bar.set_label("difference of axial Cauchy stress (kPa)", fontsize=NORMAL, color=INK)
+    bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
+    bar.outline.set_visible(False)
     return figure
 
 
@@ -112,21 +198,21 @@ def plot_convergence(study: Study) -> Picture:
     good = [(n, float(e.values[0])) for n, e in solved if e.violation(study.problem) <= FEASIBLE]
     bad = [(n, float(e.values[0])) for n, e in solved if e.violation(study.problem) > FEASIBLE]
     failed = [n + 1 for n, e in enumerate(study.evaluations) if e.failure is not None]
-    axes.plot(*np.transpose(good), "o", color=CIRCUMFERENTIAL, markersize=5, label="feasible")
+    if good:
+        axes.plot(*np.transpose(good), "o", color=CIRCUMFERENTIAL, markersize=5, label="feasible")
+        best = np.minimum.accumulate([value for _, value in good])
+        axes.step([n for n, _ in good], best, where="post", color=AXIAL, linewidth=1.8, label="best so far")
     if bad:
         axes.plot(
             *np.transpose(bad), "o", color=CIRCUMFERENTIAL, fillstyle="none", label="violates a constraint"
         )
-    best = np.minimum.accumulate([value for _, value in good])
-    axes.step([n for n, _ in good], best, where="post", color=AXIAL, linewidth=1.8, label="best so far")
-    values = [value for _, value in good]
+    values = [value for _, value in good or bad]
     low, high = min(values), max(values[0], float(np.median(values)))
     axes.set_ylim(low - 0.1 * (high - low or 1.0), high + 0.6 * (high - low or 1.0))
     if failed:
         level = np.full(len(failed), axes.get_ylim()[1])
         axes.plot(failed, level, "x", color=THIRD, clip_on=False, label="no equilibrium")
-    objective = study.problem.objective
-    dress(axes, "evaluation", f"{objective.name.replace('_', ' ')} ({objective.unit})")
+    dress(axes, "evaluation", labelled(study.problem.objective), "What was minimised")
     legend(axes)
     return figure
 
@@ -165,6 +251,20 @@ PLATES = (
         "Each layer unrolled, with the highest axial Cauchy stress through its thickness, on one colour "
         "scale; crosses mark the highest of all.",
         plot_stress,
+    ),
+    (
+        "contact_pressure",
+        "Contact pressure",
+        "The highest pressure of a jaw on the wall around the artery, for each ring of elements along it, "
+        "at the points where contact is integrated.",
+        plot_contact,
+    ),
+    (
+        "stress_difference",
+        "What changes in the wall",
+        "Highest axial Cauchy stress through each layer, unrolled: the best design less the clamp it is "
+        "compared with. Blue: less stress.",
+        plot_difference,
     ),
     (
         "convergence",

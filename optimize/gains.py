@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 MOST_PERCENT = 10.0
 """shares above this are said as multiples"""
+
+
+def with_error(value: float, error: float | None, unit: str) -> str:
+    """Such as "3 ± 0.4 kPa"; no error where it is not known."""
+    return f"{value:.4g}{'' if error is None else f' ± {error:.2g}'} {unit}".rstrip()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +25,8 @@ class Gain:
     """objective of the design that is to be better, so lower"""
     unit: str = ""
     """of both"""
+    error: float | None = None
+    """how far the difference may be off numerically, see `jaxclamp.Estimate`; None if it is not known"""
 
     @property
     def difference(self) -> float:
@@ -35,8 +43,8 @@ class Gain:
 
     @property
     def amount(self) -> str:
-        """The size of the difference with its unit, such as "3 kPa"."""
-        return f"{abs(self.difference):.4g} {self.unit}".rstrip()
+        """The size of the difference with its error and unit, such as "3 ± 0.4 kPa"."""
+        return with_error(abs(self.difference), self.error, self.unit)
 
     @property
     def percentage(self) -> str:
@@ -53,12 +61,21 @@ class Gain:
             return "the same"
         return "lower" if self.difference > 0.0 else "higher"
 
+    @property
+    def is_within_error(self) -> bool:
+        """True if the difference is no more than its error."""
+        return self.error is not None and abs(self.difference) <= self.error
+
     def __str__(self) -> str:
         """Such as "3 kPa lower (60.0%)"."""
         if self.difference == 0.0:
             return self.direction
         share = f" ({self.percentage})" if self.percentage else ""
-        return f"{self.amount} {self.direction}{share}"
+        return f"{self.amount} {self.direction}{share}{', within its error' if self.is_within_error else ''}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in study.json."""
+        return {"difference": self.difference, "error": self.error, "share": self.share}
 
     def card(self, other: str) -> tuple[str, str]:
         """A number to print large and the words below it; other: what the start is called."""

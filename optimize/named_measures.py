@@ -70,6 +70,15 @@ def named() -> dict[str, Named]:
     return found
 
 
+def in_words(measure: Measure) -> str:
+    """A measure for a reader, such as "smooth peak axial stress of the media"; a user's own as it prints."""
+    if measure.name not in {factory.__name__ for factory in jc.MEASURES}:
+        return str(measure)
+    numbers = [f" {a:g} kPa" for a in measure.arguments if isinstance(a, float)]
+    layer = [f" of the {a}" for a in measure.arguments if isinstance(a, str)][-1:]
+    return "".join([measure.name.replace("_", " "), *numbers, *layer])
+
+
 def read_measure(
     table: Any, path: str, layers: tuple[str, ...], others: tuple[str, ...] = ()
 ) -> tuple[Measure, float]:

@@ -1,4 +1,7 @@
-"""A design problem: what may change, what is minimised, and what must hold."""
+"""A design problem: what may change, what is minimised, and what must hold.
+
+A bound may be relative to the reference clamp. It becomes a number once that clamp is solved (`against`).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from jaxclamp import Measure, Scene
+from jaxclamp import Measure, Result, Scene, SceneError
 from jaxclamp.scenes.address import describe
 from optimize.variables import Entry, Variable, entries, with_design
 
@@ -23,6 +26,14 @@ class Constraint:
     """internal units"""
     upper: float = math.inf
     """internal units"""
+    relative: bool = False
+    """True: the bounds are multiples of the reference clamp's value"""
+
+    @property
+    def sides(self) -> tuple[tuple[float, float], ...]:
+        """The finite bounds, each with the sign of its margin: sign (value - bound) >= 0."""
+        found = ((self.lower, 1.0), (self.upper, -1.0))
+        return tuple((bound, sign) for bound, sign in found if math.isfinite(bound))
 
     @property
     def scale(self) -> float:
@@ -62,6 +73,20 @@ class DesignProblem:
         """
         return tuple(describe(self.scene, variable.path).path for variable in self.variables)
 
+    @cached_property
+    def rises(self) -> np.ndarray:
+        """Pairs of components of the design of which the second is at least the first, (n_pairs, 2)."""
+        rising = {describe(self.scene, v.path).key for v in self.variables if v.rising}
+        names = [entry.name.rpartition("[") for entry in self.entries]
+        pairs = [(i - 1, i) for i in range(1, len(names)) if names[i][0] in rising]
+        return np.array([p for p in pairs if names[p[0]][0] == names[p[1]][0]], int).reshape(-1, 2)
+
+    def climbs(self, design: np.ndarray) -> np.ndarray:
+        """How far each pair of `rises` rises, relative to the bounds' distance, (n_pairs,)."""
+        lower, upper = self.bounds
+        first, second = self.rises.T
+        return (design[second] - design[first]) / (upper - lower)[second]
+
     @property
     def measures(self) -> tuple[Measure, ...]:
         """The objective, then what is constrained, (n_measures,)."""
@@ -80,3 +105,48 @@ class DesignProblem:
     def scene_at(self, design: np.ndarray) -> Scene:
         """The scene with a design, (n_variables,), internal units."""
         return with_design(self.scene, self.paths, np.asarray(design, float))
+
+    @property
+    def is_relative(self) -> bool:
+        """True if a bound is relative to the reference, so that this has to be solved first."""
+        return any(constraint.relative for constraint in self.constraints)
+
+    def against(self, reference: Result) -> DesignProblem:
+        """The problem with bounds in numbers, from the reference clamp's solution.
+
+        They are rounded to `DIGITS`, so that a study that is resumed asks the same.
+        """
+        return dataclasses.replace(
+            self, constraints=tuple(_absolute(constraint, reference) for constraint in self.constraints)
+        )
+
+
+DIGITS = 6
+"""of a bound that is taken from the reference's solution"""
+
+
+def _absolute(c: Constraint, reference: Result) -> Constraint:
+    """The constraint with its bounds in internal units."""
+    if not c.relative:
+        return c
+    value = reference.measure(c.measure)
+    bound = lambda side: float(f"{side * value:.{DIGITS}g}") if math.isfinite(side) else side  # noqa: E731
+    return Constraint(c.measure, bound(c.lower), bound(c.upper))
+
+
+def require_consistent(problem: DesignProblem) -> None:
+    """Raise SceneError for variables that make no sense, and for constraints that no design can meet."""
+    _ = problem.entries, problem.rises
+    if problem.is_relative and problem.reference is None:
+        raise SceneError("a constraint is relative to the reference, but the study has no reference clamp")
+    found: dict[tuple[Measure, bool], tuple[float, float]] = {}
+    for c in problem.constraints:
+        key = c.measure, c.relative
+        lower, upper = found.get(key, (-math.inf, math.inf))
+        found[key] = lower, upper = max(lower, c.lower), min(upper, c.upper)
+        if not (lower <= upper and c.lower <= c.upper):
+            unit = " times the reference's" if c.relative else f" {c.measure.unit}".rstrip()
+            raise SceneError(
+                f"the constraints on {c.measure} contradict each other: "
+                f"no value is at least {lower:g}{unit} and at most {upper:g}{unit}"
+            )

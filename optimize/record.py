@@ -35,7 +35,8 @@ class Evaluation:
     def violation(self, problem: DesignProblem) -> float:
         """Largest relative violation of a constraint; 0 if all hold."""
         pairs = zip(problem.constraints, self.values[1:], strict=True)
-        return max((constraint.violation(float(value)) for constraint, value in pairs), default=0.0)
+        falls = -problem.climbs(self.design)
+        return max(0.0, *falls, *(constraint.violation(float(value)) for constraint, value in pairs))
 
 
 @dataclasses.dataclass
@@ -55,6 +56,7 @@ class Record:
         p = self.problem
         parts = [dump_scene(p.scene), str(p.objective), self.method, repr(p.entries)]
         parts += [f"{c.measure} {c.lower} {c.upper}" for c in p.constraints]
+        parts += [f"rising {p.rises.tolist()}"] if p.rises.size else []
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
     def best(self) -> Evaluation | None:

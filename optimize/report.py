@@ -12,11 +12,23 @@ from jaxclamp import shown_in as figures_in
 from jaxclamp.pictures.plots import Plate, png
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
-from optimize.figures import figures, shown
-from optimize.gains import Gain
+from optimize.figures import figures, labelled, shown
+from optimize.front import Front
+from optimize.front_report import write_front
+from optimize.gains import with_error
 from optimize.journal import write_bytes, write_whole
+from optimize.named_measures import in_words
 from optimize.record import FEASIBLE
 from optimize.study import Study
+
+
+def write_found(
+    found: Study | Front, folder: Path, title: str, progress: Callable[[Progress], Any] | None = None
+) -> list[Path]:
+    """What a study of one objective or of two leaves; returns the files to open."""
+    write: Any = write_front if isinstance(found, Front) else write_study
+    files: list[Path] = write(found, folder, title, progress)
+    return files
 
 
 def write_study(
@@ -42,6 +54,7 @@ def page(study: Study, title: str, plates: list[tuple[Plate, bytes]]) -> str:
     """The page of a study."""
     sections = [
         _opening(study, title),
+        section("The price: everything else that injures", _price(study)),
         figure_section(plates),
         section("Start and best", _comparison(study)),
         section("On a finer mesh, with stiffer and sharper contact", _verification(study)),
@@ -52,24 +65,68 @@ def page(study: Study, title: str, plates: list[tuple[Plate, bytes]]) -> str:
 
 
 def _opening(study: Study, title: str) -> str:
-    value = lambda result: result.measure(study.problem.objective)  # noqa: E731
-    unit, start, best = study.problem.objective.unit, value(study.start), value(study.best)
-    boxes = [Gain(start, best, unit).card("the start")]
-    if study.reference is not None:
-        boxes.append(Gain(value(study.reference), best, unit).card("the reference"))
+    objective, compared = study.problem.objective, study.compared
+    names = {"start": "the start", "reference": "the reference"}
+    gains = {said: compared.gain(name) for name, said in names.items()}
+    boxes = [gain.card(said) for said, gain in gains.items() if gain is not None]
     boxes += [
-        (f"{best:.4g} {unit}".rstrip(), str(study.problem.objective)),
+        (compared.value("best"), f"{in_words(objective)}, best"),
         (str(len(study.evaluations)), "designs evaluated"),
     ]
     cards = "".join(f"<div><b>{escape(big)}</b>{escape(said)}</div>" for big, said in boxes)
-    parts = [f"<h1>{escape(title)}</h1>", f'<p class="faint">{escape(study.stopped_because)}</p>']
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f"<p>{escape(opening_sentence(study))}</p>",
+        f'<p class="faint">{escape(study.stopped_because)}</p>',
+    ]
     if (said := warning(study)) is not None:
-        parts.append(f'<div class="notice"><b>{escape(said[:1].upper() + said[1:])}.</b></div>')
+        parts.append(f'<div class="notice"><b>{escape(_capital(said))}.</b></div>')
     return "\n".join(parts) + f'\n<div class="headlines">{cards}</div>'
 
 
-def warning(study: Study) -> str | None:
+def opening_sentence(study: Study) -> str:
+    """What was minimised, what came of it, and what it costs."""
+    objective, compared = study.problem.objective, study.compared
+    values = ", ".join(f"{name} {compared.value(name)}" for name in ("best", compared.other))
+    gain = compared.gain(compared.other)
+    return f"{labelled(objective)}: {values}; best is {gain}. {_capital(compared.sentence)}."
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _price(study: Study) -> str:
+    """The table of every other injury measure, on the study's model and on the finer one."""
+    models, other = [("study's model", study.compared)], study.compared.other
+    finer = None if study.verification is None else study.verification.after
+    if finer is not None and finer.price and finer.other == other:
+        models.append(("finer model", finer))
+    rows = [
+        [
+            f"{labelled(change.measure)}, {model}",
+            number(change.best.value),
+            number(change.other.value),
+            with_error(change.difference.value, change.difference.error, ""),
+            change.word,
+        ]
+        for changes in zip(*(compared.price for _, compared in models), strict=False)
+        for (model, _), change in zip(models, changes, strict=True)
+    ]
+    said = (
+        f"Best against {other}. The error of a difference is estimated on the difference: for each source "
+        "(mesh by a coarser twin, bulk modulus, stiffness and smoothing of contact by derivatives of the "
+        "solution) the signed estimate of the one less that of the other, and the sum of the sizes of what "
+        "is left."
+    )
+    head = ["injury measure", "best", other, "difference", ""]
+    return f'{table(head, rows)}<p class="faint">{escape(said)}</p>'
+
+
+def warning(study: Study | Front) -> str | None:
     """What a reader has to know before building this jaw; None if nothing."""
+    if isinstance(study, Front):
+        return study.warning
     best = next(e for e in study.evaluations if e.design is study.best_design)
     if best.violation(study.problem) > FEASIBLE:
         return f"no design met the constraints; the best violates them by {best.violation(study.problem):.1%}"
@@ -112,8 +169,7 @@ def _verification(study: Study) -> str:
     unit = f" ({unit})" if unit else ""
     rows.append([f"objective, study's model{unit}", *(number(found.coarse[name]) for name in results)])
     rows.append([f"objective, finer{unit}", *(number(found.fine[name]) for name in results)])
-    sentence = found.sentence
-    return f"<p>{escape(sentence[:1].upper() + sentence[1:])}.</p>" + table(["", *results], rows)
+    return f"<p>{escape(_capital(found.sentence))}.</p>" + table(["", *results], rows)
 
 
 def _design(study: Study) -> str:

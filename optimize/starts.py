@@ -50,14 +50,20 @@ class Budget:
 
 
 def drive(
-    record: Record, budget: Budget, journal: Journal | None, tell: Callable[[Progress], Any]
+    record: Record,
+    budget: Budget,
+    journal: Journal | None,
+    tell: Callable[[Progress], Any],
+    near: tuple[np.ndarray, Result] | None = None,
 ) -> tuple[Result | None, str]:
     """Let the driver work until it is content or the budget is spent; the record grows.
+
+    near: a design and its solution to start from; None: the start is solved from scratch
 
     Returns the solution of the start design (None if that was on record) and why the driver ended.
     Raises EquilibriumError or SceneError if the start has no equilibrium, OSError from the journal.
     """
-    evaluator = Evaluator(record, journal, budget.max_evaluations, tell)
+    evaluator = Evaluator(record, journal, budget.max_evaluations, tell, near)
     try:
         stopped = METHODS[budget.method].drive(evaluator.target(budget.tolerance))
     except Enough:

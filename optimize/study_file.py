@@ -1,27 +1,36 @@
-"""Study files (TOML): a scene, what may change, what is minimised and what must hold."""
+"""Study files (TOML): a scene, what may change, what is minimised and what must hold.
+
+A bound of a constraint is a number, or "reference": the value of the scene's own clamp.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxclamp import Failure, Progress, Scene, SceneError, load_scene
+from jaxclamp import Failure, Measure, Progress, Scene, SceneError, load_scene
 from jaxclamp.scenes.address import describe
 from jaxclamp.scenes.files import read_text
 from jaxclamp.scenes.schema import shown, toml_value
 from jaxclamp.scenes.toml import parsed
 from jaxclamp.scenes.wording import did_you_mean, shortened
 from optimize.drivers import METHODS
+from optimize.front import Front, front
 from optimize.named_measures import read_measure
 from optimize.numbers import MOST, number
-from optimize.problem import Constraint, DesignProblem
+from optimize.problem import Constraint, DesignProblem, require_consistent
+from optimize.starts import Budget
 from optimize.study import Study, minimise
 from optimize.variables import Variable
 
 LONGEST_NAME = 1000
 """characters of the name of a scene or its file"""
+
+REFERENCE = "reference"
+"""a bound at the value of the scene's own clamp"""
 
 KEYS = (
     "title",
@@ -33,6 +42,8 @@ KEYS = (
     "tolerance",
     "starts",
     "objective",
+    "objectives",
+    "points",
     "variables",
     "constraints",
 )
@@ -55,11 +66,18 @@ class StudyFile:
     """relative change of the objective that no longer matters"""
     starts: int
     """designs to start from: the file's, and others drawn between the bounds"""
+    second: Measure | None = None
+    """the other objective of a study with two"""
+    points: int = 5
+    """of the front of two objectives"""
 
     def run(
         self, folder: Path, resume: bool = False, progress: Callable[[Progress], Any] | None = None
-    ) -> Study:
+    ) -> Study | Front:
         """Do the study in a folder. Raises SceneError, EquilibriumError, OSError."""
+        if self.second is not None:
+            budget = Budget(self.method, self.max_evaluations, self.tolerance)
+            return front(self.problem, self.second, self.points, budget, folder, resume, progress)
         return minimise(
             self.problem,
             method=self.method,
@@ -92,7 +110,7 @@ def _study(table: dict[str, Any], folder: Path) -> StudyFile:
             raise SceneError(f"unknown key {shortened(key)}; {did_you_mean(key, list(KEYS))}")
     reference, start = _scenes(table, folder)
     layers = tuple(layer.name for layer in start.artery.layers)
-    objective, _ = read_measure(table.get("objective"), "objective", layers)
+    objective, second = _objectives(table, layers)
     problem = DesignProblem(
         scene=start,
         objective=objective,
@@ -100,20 +118,40 @@ def _study(table: dict[str, Any], folder: Path) -> StudyFile:
             _variable(item, start, f"variables[{i}]") for i, item in enumerate(_tables(table, "variables"))
         ),
         constraints=tuple(
-            _constraint(item, layers, f"constraints[{i}]")
+            constraint
             for i, item in enumerate(_tables(table, "constraints"))
+            for constraint in _constraints(item, layers, f"constraints[{i}]")
         ),
         reference=None if reference is start else reference,
     )
-    _ = problem.entries
+    require_consistent(problem)
     return StudyFile(
         title=_text(table, "title", "Jaw study"),
         problem=problem,
         method=_choice(table, "method", "slsqp", tuple(METHODS)),
         max_evaluations=_whole(table, "max_evaluations", 40, 1, 10_000),
         tolerance=number(table.get("tolerance", 1e-4), "tolerance", 1e-12, 1.0),
-        starts=_whole(table, "starts", 1, 1, 100),
+        starts=_whole(table, "starts", 1, 1, 100 if second is None else 1),
+        second=second,
+        points=_whole(table, "points", 5, 2, 100),
     )
+
+
+def _objectives(table: dict[str, Any], layers: tuple[str, ...]) -> tuple[Measure, Measure | None]:
+    """What is minimised, and the other objective of a study with [[objectives]]."""
+    if "objectives" not in table:
+        if "points" in table:
+            raise SceneError("points: they are of a front, of a study with two [[objectives]]")
+        return read_measure(table.get("objective"), "objective", layers)[0], None
+    if "objective" in table:
+        raise SceneError("objective: expected either [objective] or two [[objectives]], found both")
+    items = _tables(table, "objectives")
+    if len(items) != 2:
+        raise SceneError(f"objectives: expected two tables, found {len(items)}")
+    first, second = (read_measure(item, f"objectives[{i}]", layers)[0] for i, item in enumerate(items))
+    if first == second:
+        raise SceneError(f"objectives: expected two measures, found {first} twice")
+    return first, second
 
 
 def _scenes(table: dict[str, Any], folder: Path) -> tuple[Scene, Scene]:
@@ -158,11 +196,13 @@ def _tables(table: dict[str, Any], key: str) -> list[Any]:
 def _variable(item: Any, scene: Scene, path: str) -> Variable:
     if not isinstance(item, dict) or not isinstance(item.get("key"), str):
         raise SceneError(f"{path}: expected a table with key, lower and upper")
+    known = ("key", "lower", "upper", "rising")
     for name in item:
-        if name not in ("key", "lower", "upper"):
-            raise SceneError(
-                f"unknown key {path}.{shortened(name)}; {did_you_mean(name, ['key', 'lower', 'upper'])}"
-            )
+        if name not in known:
+            raise SceneError(f"unknown key {path}.{shortened(name)}; {did_you_mean(name, list(known))}")
+    rising = item.get("rising", False)
+    if not isinstance(rising, bool):
+        raise SceneError(f"{path}.rising = {shown(rising)}: expected true or false")
     factor = describe(scene, item["key"]).factor
 
     def bound(side: str) -> tuple[float, ...] | None:
@@ -171,16 +211,27 @@ def _variable(item: Any, scene: Scene, path: str) -> Variable:
         given = item[side] if isinstance(item[side], list) else [item[side]]
         return tuple(factor * number(v, f"{path}.{side}", -MOST, MOST) for v in given)
 
-    return Variable(item["key"], bound("lower"), bound("upper"))
+    return Variable(item["key"], bound("lower"), bound("upper"), rising)
 
 
-def _constraint(item: Any, layers: tuple[str, ...], path: str) -> Constraint:
+def _constraints(item: Any, layers: tuple[str, ...], path: str) -> list[Constraint]:
+    """The constraints of a table: one for its numbers, one for its bounds at the reference's value."""
     measure, factor = read_measure(item, path, layers, ("lower", "upper"))
     sides = {side: item[side] for side in ("lower", "upper") if side in item}
     if not sides:
         raise SceneError(f"{path}: expected lower, upper or both")
-    bounds = {side: factor * number(value, f"{path}.{side}", -MOST, MOST) for side, value in sides.items()}
-    return Constraint(measure, **bounds)
+    relative = {side: 1.0 for side, value in sides.items() if value == REFERENCE}
+    bounds = {
+        side: factor * number(value, f"{path}.{side}", -MOST, MOST, f'"{REFERENCE}" or a number')
+        for side, value in sides.items()
+        if side not in relative
+    }
+    given = ((bounds, False), (relative, True))
+    return [
+        Constraint(measure, b.get("lower", -math.inf), b.get("upper", math.inf), is_relative)
+        for b, is_relative in given
+        if b
+    ]
 
 
 def _whole(table: dict[str, Any], key: str, default: int, least: int, most: int) -> int:

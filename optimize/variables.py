@@ -27,6 +27,8 @@ class Variable:
     """internal units"""
     upper: float | tuple[float, ...] | None = None
     """internal units"""
+    rising: bool = False
+    """True: no item of the list is less than the one before, as slopes of a convex face are"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +64,8 @@ def entries(scene: Scene, variables: tuple[Variable, ...]) -> tuple[Entry, ...]:
 
 def _entries(place: Place, variable: Variable) -> list[Entry]:
     """The components of one variable, with their bounds checked."""
+    if variable.rising and np.ndim(place.value) == 0:
+        raise SceneError(f"{place.key}: a single number cannot be rising, only a list of them can")
     values = np.atleast_1d(np.asarray(place.value, dtype=float))
     lowest = _bounds(variable.lower, place.range.lower * place.factor, values.size, place.key)
     highest = _bounds(variable.upper, place.range.upper * place.factor, values.size, place.key)

@@ -5,8 +5,19 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from jaxclamp import EquilibriumError, Result, Scene, SceneError, TooLittleMemory, clamp, replace
+from jaxclamp import (
+    EquilibriumError,
+    Measure,
+    Result,
+    Scene,
+    SceneError,
+    TooLittleMemory,
+    clamp,
+    neighbours,
+    replace,
+)
 from optimize.gains import Gain
+from optimize.price import Compared
 from optimize.problem import DesignProblem
 
 STIFFER = 2.0
@@ -37,15 +48,23 @@ class Verification:
     """of the finer mesh"""
     unit: str = ""
     """of the objective"""
+    before: Compared | None = None
+    """the same clamps with their errors on the study's own model; None: no errors are known"""
+    after: Compared | None = None
+    """on the finer model"""
 
     @property
     def gain_before(self) -> Gain:
         """From start to best on the study's own model."""
-        return Gain(self.coarse["start"], self.coarse["best"], self.unit)
+        found = None if self.before is None else self.before.gain("start")
+        return found or Gain(self.coarse["start"], self.coarse["best"], self.unit)
 
     @property
     def gain(self) -> Gain | None:
         """The same on the finer model; None if that is not known."""
+        found = None if self.after is None else self.after.gain("start")
+        if found is not None:
+            return found
         start, best = self.fine["start"], self.fine["best"]
         return None if start is None or best is None else Gain(start, best, self.unit)
 
@@ -66,7 +85,9 @@ class Verification:
         if self.gain_before.difference <= 0.0:
             verdict = "there was no gain to lose"
         model = f"{self.elements} elements with harder contact"
-        return f"{verdict} on {model}: best against start is {self.gain}; before, it was {self.gain_before}"
+        said = f"{verdict} on {model}: best against start is {self.gain}; before, it was {self.gain_before}"
+        now, before = (c and c.gain("reference") for c in (self.after, self.before))
+        return said if now is None else f"{said}. Best against reference is {now}; before, it was {before}"
 
     def to_dict(self) -> dict[str, Any]:
         """As in study.json."""
@@ -78,16 +99,27 @@ class Verification:
         said = {
             "gain": None if gain is None else gain.share,
             "gain_difference": None if gain is None else gain.difference,
+            "gain_error": None if gain is None else gain.error,
+            **({} if self.after is None else self.after.to_dict()),
             "survives": self.survives,
             "elements": self.elements,
         }
         return {**blocks, **said, "failure": self.failure}
 
 
-def verify(problem: DesignProblem, results: dict[str, Result]) -> Verification:
-    """Solve the results "start" and "best" (and others) on the finer model, carried over from their own."""
+def verify(
+    problem: DesignProblem,
+    results: dict[str, Result],
+    measures: tuple[Measure, ...] = (),
+    before: Compared | None = None,
+) -> Verification:
+    """Solve the results "start" and "best" (and others) on the finer model, carried over from their own.
+
+    measures: whose errors are estimated there; before: the same on the study's own model
+    """
     fine: dict[str, float | None] = dict.fromkeys(results)
     final: dict[str, dict[str, Any] | None] = dict.fromkeys(results)
+    estimates = {}
     failure, elements = None, 0
     for name, result in results.items():
         try:
@@ -97,5 +129,9 @@ def verify(problem: DesignProblem, results: dict[str, Result]) -> Verification:
             continue
         fine[name], final[name] = found.measure(problem.objective), found.final
         elements = found.model.mesh.n_cells
+        if measures:
+            estimates[name] = neighbours(found).estimates(measures)
     coarse = {name: result.measure(problem.objective) for name, result in results.items()}
-    return Verification(coarse, fine, final, failure, elements, problem.objective.unit)
+    after = Compared(problem.objective, estimates) if measures else None
+    unit = problem.objective.unit
+    return Verification(coarse, fine, final, failure, elements, unit, before, after)

@@ -136,6 +136,31 @@ def nodal_contact_pressure(model: Model, state: State) -> np.ndarray:
     return np.divide(force, around, out=np.zeros(n), where=around > 0.0)
 
 
+def contact_along(model: Model, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Where along the artery each ring of facets is pressed most (mm), and how much (kPa), (n_rings,) each.
+
+    At the points where contact is integrated, over all jaws, mirror images included, in order.
+    """
+    n_r, n_c, _ = model.mesh.grid
+    rings, heights, places = [], [], []
+    for group in model.potential.of(JAWS):
+        nodes = np.asarray(group.nodes)
+        pressure = np.asarray(_facet_contact(group, state)[0])  # (n_q, n_facets)
+        z = np.asarray(group.here(JAWS).rule.N) @ np.asarray(state.x)[nodes, 2]
+        rings.append(np.min(nodes, axis=0) // (n_c * n_r))
+        highest = np.argmax(pressure, axis=0)[None]
+        heights.append(np.take_along_axis(pressure, highest, 0)[0])
+        places.append(np.take_along_axis(z, highest, 0)[0])
+    ring, height, place = map(np.concatenate, (rings, heights, places))
+    order = np.lexsort((height, ring))
+    last = order[np.flatnonzero(np.diff(np.append(ring[order], -1)))]  # the highest of each ring
+    z, p = place[last], height[last]
+    if "z" in model.symmetry:
+        z, p = np.append(z, -z), np.append(p, p)
+    along = np.argsort(z)
+    return z[along], p[along]
+
+
 # --------------------------------------------------------------------------------- the whole artery
 
 

@@ -39,7 +39,8 @@ p { margin: .4rem 0; } .faint { color: var(--faint); }
 .notice { border-left: 4px solid var(--look); background: var(--card); padding: .7rem 1rem; margin: 1rem 0; }
 .headlines { display: grid; grid-template-columns: repeat(auto-fit, minmax(12rem, 1fr)); gap: .8rem;
   margin: 1.3rem 0; }
-.headlines div { background: var(--card); border-radius: 6px; padding: .8rem 1rem; }
+.headlines div { background: var(--card); border-radius: 6px; padding: .8rem 1rem; min-width: 0;
+  overflow-wrap: anywhere; }
 .headlines b { display: block; font-size: 1.6rem; font-weight: 600; font-variant-numeric: tabular-nums; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }

@@ -218,6 +218,7 @@ class LinearSolver:
                 failure = Singular(f"{name} does not load: {error}")
         raise failure
 
+    @np.errstate(over="ignore", invalid="ignore")  # an error that overflows is too large, and refused
     def solve(self, b: np.ndarray) -> np.ndarray:
         """Solve K x = b for b (n, n_rhs), checked. Raises Singular if it is not accurate."""
         while True:

@@ -9,19 +9,28 @@ Four sources, each an estimate of (figure - exact figure), in the figure's unit:
 - contact smoothing: the jaws touch before they touch; with figure = exact + a smoothing.
 
 The error of a figure is the sum of their sizes. It says nothing of the model: of constants, of symmetry.
+
+Two clamps on one artery are wrong in much the same way, so that their difference is known far better than
+either: the error of a difference is estimated source by source, the signed estimate of the one less that of
+the other, and the sum of the sizes of what is left (`Estimate.__sub__`).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
+from typing import TypeVar
 
 import jax
 import numpy as np
+from jax import Array
 
 from jaxclamp.core.failures import EquilibriumError, Singular
-from jaxclamp.observe.figures import FIGURES, WHOLE
+from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.figures import FIGURES, POINT, WHOLE
+from jaxclamp.observe.measures import Measure
 from jaxclamp.scenes.address import get, replace
 from jaxclamp.scenes.scene import MeshSettings, Scene
 from jaxclamp.solve.clamping import clamp, inflate
@@ -35,6 +44,32 @@ COARSENINGS = (1.3, 2.0)
 SOURCES = ("discretisation", "bulk", "contact_stiffness", "contact_smoothing")
 
 Errors = dict[str, dict[str, float | None]]
+Key = TypeVar("Key", bound=Hashable)
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """A figure, or a difference of two, and what is known of how far it is off."""
+
+    value: float
+    """as computed"""
+    sources: dict[str, float | None]
+    """by `SOURCES`: estimates of (value - exact value), in the figure's unit; None if it is not known"""
+
+    @property
+    def error(self) -> float | None:
+        """Sum of the sizes of the sources; None if one of them is not known."""
+        known = [abs(part) for part in self.sources.values() if part is not None]
+        return sum(known) if len(known) == len(self.sources) else None
+
+    def __sub__(self, other: Estimate) -> Estimate:
+        """The difference: what both have of an error cancels, source by source, before sizes are added."""
+        left = {name: _difference(part, other.sources[name]) for name, part in self.sources.items()}
+        return Estimate(self.value - other.value, left)
+
+
+def _difference(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else a - b
 
 
 def figures(result: Result) -> dict[str, float]:
@@ -68,25 +103,106 @@ def coarser(mesh: MeshSettings) -> tuple[MeshSettings, float]:
     return coarse, (cells[0] / cells[1]) ** (1.0 / 3.0)
 
 
-def estimate(result: Result) -> Errors:
+@dataclasses.dataclass(frozen=True)
+class Neighbours:
+    """A result, the same scene on a coarser mesh, and to first order with other penalties.
+
+    They are solved once; any number of figures and measures can then be estimated.
+    """
+
+    result: Result
+    """whose errors are asked for"""
+    twin: Result | None
+    """on a coarser mesh; None if that has no equilibrium"""
+    ratio: float
+    """elements of the scene over elements of the twin, per direction"""
+    penalised: dict[str, tuple[Result | None, float]]
+    """by source: the result with a penalty raised by `CHANGE` (None if it was refused), and the sign of
+    the source against the derivative by the penalty's logarithm"""
+
+    def estimates(self, measures: Sequence[Measure]) -> dict[Measure, Estimate]:
+        """Measures with their errors, in internal units; the result has reached its stop."""
+
+        def read(result: Result) -> dict[Measure, float]:
+            result.require(any(m.needs_stop for m in measures))
+            return dict(zip(measures, map(float, _measured(tuple(measures), result.equilibria)), strict=True))
+
+        return self.read(read, lambda m: WHOLE if m.name in WHOLES else POINT)
+
+    def read(
+        self, read: Callable[[Result], dict[Key, float]], order: Callable[[Key], float]
+    ) -> dict[Key, Estimate]:
+        """Numbers of the result by key, with their errors; order: with which a number converges."""
+        values = read(self.result)
+        twin = None if self.twin is None else read(self.twin)
+        others = {
+            name: (None if near is None else read(near), sign)
+            for name, (near, sign) in self.penalised.items()
+        }
+        return {
+            key: Estimate(
+                value,
+                {
+                    "discretisation": None
+                    if twin is None
+                    else (value - twin[key]) / (1.0 - self.ratio ** order(key))
+                }
+                | {
+                    name: None if near is None else _finite(sign * (near[key] - value) / CHANGE)
+                    for name, (near, sign) in others.items()
+                },
+            )
+            for key, value in values.items()
+        }
+
+
+def _measures(measures: tuple[Measure, ...], equilibria: Equilibria) -> list[Array]:
+    return [measure(equilibria) for measure in measures]
+
+
+# called once for each neighbour, it is compiled for a short compilation rather than for speed
+_measured = partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})(
+    _measures
+)
+
+WHOLES = (
+    "clamp_force",
+    "jaw_travel",
+    "lumen_height",
+    "lumen_width",
+    "lumen_area",
+    "mean_contact_pressure",
+    "stored_energy",
+    "physiological_lumen_radius",
+)
+"""measures that converge as figures of the whole; any other is taken to converge as one at a point"""
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def neighbours(result: Result) -> Neighbours:
+    """What the errors of a result are read off: some iterations on a coarser twin, a few linear solves."""
+    penalties = {
+        "bulk": (bulk_paths(result.scene), -1.0),
+        "contact_stiffness": (("contact.stiffness",), -1.0),
+        "contact_smoothing": (("contact.smoothing",), 1.0),
+    }
+    twin, ratio = _twin(result)
+    penalised = {name: (_penalised(result, paths), sign) for name, (paths, sign) in penalties.items()}
+    return Neighbours(result, twin, ratio, penalised)
+
+
+def estimate(result: Result, near: Neighbours | None = None) -> Errors:
     """Errors by figure: `value`, `error` (None if it is not known) and the four signed sources."""
-    values = figures(result)
-    sources = {
-        "discretisation": _from_the_mesh(result, values),
-        "bulk": _from_a_penalty(result, values, bulk_paths(result.scene), -1.0),
-        "contact_stiffness": _from_a_penalty(result, values, ("contact.stiffness",), -1.0),
-        "contact_smoothing": _from_a_penalty(result, values, ("contact.smoothing",), 1.0),
-    }
-    return {
-        key: {"value": value, "error": _total([part[key] for part in sources.values()])}
-        | {name: part[key] for name, part in sources.items()}
-        for key, value in values.items()
-    }
+    found = (near or neighbours(result)).read(figures, _order)
+    return {key: {"value": e.value, "error": e.error} | e.sources for key, e in found.items()}
 
 
-def with_errors(result: Result) -> Result:
-    """The result with its errors estimated: some iterations on a coarser twin, a few linear solves."""
-    return dataclasses.replace(result, errors=estimate(result))
+def with_errors(result: Result, near: Neighbours | None = None) -> Result:
+    """The result with its errors estimated, from its neighbours if they are at hand."""
+    return dataclasses.replace(result, errors=estimate(result, near))
 
 
 def bulk_paths(scene: Scene) -> tuple[str, ...]:
@@ -94,23 +210,17 @@ def bulk_paths(scene: Scene) -> tuple[str, ...]:
     return tuple(f"artery.layers[{i}].material.bulk" for i in range(len(scene.artery.layers)))
 
 
-def _total(parts: list[float | None]) -> float | None:
-    known = [abs(part) for part in parts if part is not None]
-    return sum(known) if len(known) == len(parts) else None
-
-
-def _from_the_mesh(result: Result, values: dict[str, float]) -> dict[str, float | None]:
-    """Figure less the figure on an infinitely fine mesh; None where the twin has no equilibrium."""
-    if any(np.ndim(leaf) > 1 for leaf in jax.tree_util.tree_leaves(result.scene.artery)):
-        return dict.fromkeys(values)  # constants of each point belong to one mesh
+def _twin(result: Result) -> tuple[Result | None, float]:
+    """The scene on a coarser mesh, if it has an equilibrium there, and how much coarser per direction."""
     mesh, ratio = coarser(result.scene.mesh)
+    if any(np.ndim(leaf) > 1 for leaf in jax.tree_util.tree_leaves(result.scene.artery)):
+        return None, ratio  # constants of each point belong to one mesh
     scene = dataclasses.replace(result.scene, mesh=mesh)
     solve: Callable[..., Result] = clamp if result.states[-1].stage == "clamping" else inflate
     try:
-        twin = figures(solve(scene, guess=result))
+        return solve(scene, guess=result), ratio
     except EquilibriumError:
-        return dict.fromkeys(values)
-    return {key: (value - twin[key]) / (1.0 - ratio ** _order(key)) for key, value in values.items()}
+        return None, ratio
 
 
 def _order(key: str) -> float:
@@ -120,20 +230,12 @@ def _order(key: str) -> float:
     return orders.get(name) or WHOLE
 
 
-def _from_a_penalty(
-    result: Result, values: dict[str, float], paths: tuple[str, ...], sign: float
-) -> dict[str, float | None]:
-    """Sign times the derivative of each figure by the logarithm of a penalty's constants; None if refused."""
-    scene = multiplied(result.scene, paths, 1.0 + CHANGE)
+def _penalised(result: Result, paths: tuple[str, ...]) -> Result | None:
+    """The result with a penalty's constants raised by `CHANGE`, to first order; None if it is refused."""
     try:
-        near = figures(predicted(result, scene))
-    except (
-        EquilibriumError,
-        Singular,
-    ):  # the result stays, its error is not known
-        return dict.fromkeys(values)
-    slopes = {key: sign * (near[key] - value) / CHANGE for key, value in values.items()}
-    return {key: slope if math.isfinite(slope) else None for key, slope in slopes.items()}
+        return predicted(result, multiplied(result.scene, paths, 1.0 + CHANGE))
+    except (EquilibriumError, Singular):  # the result stays, its error is not known
+        return None
 
 
 def multiplied(scene: Scene, paths: tuple[str, ...], factor: float) -> Scene:

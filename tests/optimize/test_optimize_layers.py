@@ -24,16 +24,19 @@ LEVEL = {
     "named_measures": 1,
     "variables": 0,
     "problem": 1,
+    "price": 2,
     "record": 2,
-    "verification": 2,
+    "verification": 3,
     "evaluator": 3,
     "resuming": 3,
     "starts": 4,
     "study": 5,
     "figures": 6,
-    "study_file": 6,
-    "report": 7,
-    "__init__": 8,
+    "front": 6,
+    "front_report": 7,
+    "study_file": 7,
+    "report": 8,
+    "__init__": 9,
 }
 
 MODULES = sorted(path.stem for path in (ROOT / "optimize").rglob("*.py"))

@@ -115,6 +115,22 @@ def test_a_back_end_that_solves_wrongly_hands_over(monkeypatch):
 
 
 @pytest.mark.skipif(len(BACK_END_NAMES) < 2, reason="needs two back ends")
+@pytest.mark.parametrize("size", [1e200, 1e308, np.inf, np.nan])
+def test_a_solution_that_overflows_hands_over_silently(monkeypatch, size):
+    """A tangent that is all but singular: what a back end makes of it may be beyond any float."""
+    pattern, values, dense = indefinite(60, 0.0, 7)
+    first = BACK_ENDS[available()[0]][0]
+    monkeypatch.setattr(first, "solve", lambda self, b: np.full_like(b, size))
+    solver = LinearSolver(pattern)
+    solver.factor(values)
+    b = np.ones((60, 1))
+    if len(available()) == 1:
+        with pytest.raises(Singular):
+            solver.solve(b)
+    else:
+        np.testing.assert_allclose(solver.solve(b), np.linalg.solve(dense, b), rtol=1e-8)
+
+
 def test_a_back_end_that_cannot_factor_hands_over(monkeypatch):
     pattern, values, dense = indefinite(100, 0.2, 8)
     first = BACK_ENDS[BACK_END_NAMES[0]][0]

@@ -87,11 +87,7 @@ def unrolled(
 
     angles: from `load_free_angles`, deg, (n,); zoom: half the length shown, mm
     """
-    grid = whole_grid(layer)
-    stress = grid.point_data[FIELD][:, grid.upper]
-    highest = np.argmax(stress, axis=2)[..., None]
-    value = np.take_along_axis(stress, highest, axis=2)[..., 0]
-    z = np.take_along_axis(grid.points[:, grid.upper, :, 2], highest, axis=2)[..., 0]
+    z, value = highest_through(layer)
     angle = np.broadcast_to(angles, value.shape)
     inside = np.where(np.abs(z) <= zoom, value, -np.inf)
     peaks = inside >= np.max(inside) - EQUALLY_HIGH * np.max(np.abs(value))
@@ -104,9 +100,7 @@ def unrolled(
         shading="gouraud",
         rasterized=True,
     )
-    axes.set_xlim(-zoom, zoom)
-    axes.set_ylim(0.0, 180.0)
-    axes.set_yticks([0, 45, 90, 135, 180], ["0, fold", "45", "90, jaw", "135", "180, fold"])
+    frame_of_map(axes, zoom)
     axes.plot(
         z[peaks],
         angle[peaks],
@@ -118,6 +112,22 @@ def unrolled(
     )
     if mark_P:
         _P(axes, 0.0, 90.0)
+
+
+def highest_through(layer: LayerFields) -> tuple[np.ndarray, np.ndarray]:
+    """Position along the artery (mm), highest axial stress through a layer (kPa), upper half, (n_z, n_c)."""
+    grid = whole_grid(layer)
+    stress = grid.point_data[FIELD][:, grid.upper]
+    highest = np.argmax(stress, axis=2)[..., None]
+    value = np.take_along_axis(stress, highest, axis=2)[..., 0]
+    return np.take_along_axis(grid.points[:, grid.upper, :, 2], highest, axis=2)[..., 0], value
+
+
+def frame_of_map(axes: Axes, zoom: float) -> None:
+    """Limits and angles of an unrolled upper half; zoom: half the length shown, mm."""
+    axes.set_xlim(-zoom, zoom)
+    axes.set_ylim(0.0, 180.0)
+    axes.set_yticks([0, 45, 90, 135, 180], ["0, fold", "45", "90, jaw", "135", "180, fold"])
 
 
 def _outlined() -> list[AbstractPathEffect]:

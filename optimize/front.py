@@ -1,0 +1,248 @@
+"""What two objectives cost each other: designs that are best in the one for a limit on the other.
+
+The ends are the designs of least first and of least second objective. In between the first is minimised
+under limits on the second, evenly spread between its values at the ends (epsilon-constraints). Every point
+is a search of its own with its own journal, begun at the best design that the searches before it have met,
+and solved from the nearest of theirs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxclamp import EquilibriumError, Measure, Progress, Result, SceneError, clamp, versions
+from optimize.journal import Journal
+from optimize.named_measures import in_words
+from optimize.problem import Constraint, DesignProblem
+from optimize.record import FEASIBLE, Evaluation, Record
+from optimize.resuming import take_over
+from optimize.starts import Budget, drive
+from optimize.study import found_cold, require_solvable, with_bounds
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """A design of the front."""
+
+    folder: str
+    """of its search"""
+    limit: float | None
+    """on the second objective, internal units; None at an end"""
+    design: np.ndarray
+    """(n_variables,), internal units"""
+    values: tuple[float, float]
+    """both objectives"""
+    violation: float
+    """of the constraints, relative"""
+    result: Result
+    """solved from scratch"""
+    evaluations: int
+    """of its search"""
+    stopped_because: str
+    """the driver's own words, or that the budget was spent"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Front:
+    """What a study with two objectives found."""
+
+    problem: DesignProblem
+    """with the first objective"""
+    second: Measure
+    """the other objective"""
+    points: tuple[Point, ...]
+    """from the least first objective to the least second one"""
+    others: dict[str, tuple[float, float]]
+    """both objectives of the start and of the reference"""
+    seconds: float
+    """wall time"""
+
+    @property
+    def objectives(self) -> tuple[Measure, Measure]:
+        """Both."""
+        return self.problem.objective, self.second
+
+    def lines(self) -> list[str]:
+        """What came of it, for a terminal."""
+        first, second = (f"{in_words(m)} ({m.unit})" for m in self.objectives)
+        said = [f"  {first}, {second}"]
+        rows = {point.folder: point.values for point in self.points} | self.others
+        return said + [f"    {name:<12}{a:>10.4g}{b:>10.4g}" for name, (a, b) in rows.items()]
+
+    @property
+    def warning(self) -> str | None:
+        """What a reader has to know; None if nothing."""
+        bad = [point.folder for point in self.points if point.violation > FEASIBLE]
+        return f"no design met the constraints of {', '.join(bad)}" if bad else None
+
+    def is_beaten(self, point: Point) -> bool:
+        """True if another point is better in one objective and no worse in the other."""
+        a = np.array(point.values)
+        return any(np.all(p.values <= a) and np.any(p.values < a) for p in self.points)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows of iterations.csv: one for each point, file units for the design."""
+        names = [str(m) for m in self.objectives]
+        entries = self.problem.entries
+        return [
+            {"point": p.folder, **dict(zip(names, p.values, strict=True))}
+            | {e.name: v / e.factor for e, v in zip(entries, p.design, strict=True)}
+            for p in self.points
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of study.json."""
+        factors = np.array([entry.factor for entry in self.problem.entries])
+        return {
+            "title": self.problem.scene.title,
+            "objectives": [f"{m} [{m.unit}]" for m in self.objectives],
+            "design": {
+                "names": [entry.name for entry in self.problem.entries],
+                "units": [entry.unit for entry in self.problem.entries],
+            },
+            "front": [
+                {
+                    "folder": p.folder,
+                    "limit": p.limit,
+                    "objectives": list(p.values),
+                    "design": (p.design / factors).tolist(),
+                    "violation": p.violation,
+                    "beaten": self.is_beaten(p),
+                    "evaluations": p.evaluations,
+                    "stopped_because": p.stopped_because,
+                    "final": p.result.final,
+                }
+                for p in self.points
+            ],
+            **{name: {"objectives": list(values)} for name, values in self.others.items()},
+            "cost": {"wall_s": self.seconds},
+            "versions": versions(),
+        }
+
+
+def front(
+    problem: DesignProblem,
+    second: Measure,
+    count: int,
+    budget: Budget,
+    folder: Path,
+    resume: bool = False,
+    progress: Callable[[Progress], Any] | None = None,
+) -> Front:
+    """The front of the problem's objective and a second measure, `count` points, at least the two ends.
+
+    folder: every search keeps its journal in a subfolder, point-1 and so on; with `resume`, goes on there
+
+    Raises SceneError for a problem that makes no sense, EquilibriumError if the start or the reference has no
+    solution, OSError if the folder cannot be written.
+    """
+    begun, tell = time.perf_counter(), progress or (lambda event: None)
+    require_solvable(limited(problem, second, None), budget.method)
+    journal = Journal(folder, resume)
+    try:
+        if journal.found is not None and "front" not in journal.found:
+            raise SceneError(f"{journal.path}: the study in that folder is another one, of one objective")
+        bounded, reference = with_bounds(problem, tell)
+        points = _Searches(bounded, second, budget, folder, resume, tell).points(count)
+        if reference is None and problem.reference is not None:
+            reference = _clamped(problem.reference)
+        solved = {"start": _clamped(problem.scene), "reference": reference}
+        others = {
+            name: (result.measure(problem.objective), result.measure(second))
+            for name, result in solved.items()
+            if result is not None
+        }
+        found = Front(problem, second, points, others, time.perf_counter() - begun)
+        journal.write(found.to_dict(), found.rows())
+        return found
+    finally:
+        journal.close()
+
+
+def _clamped(scene: Any) -> Result | None:
+    """The scene's solution; None if it has none."""
+    try:
+        return clamp(scene)
+    except EquilibriumError:
+        return None
+
+
+class _Searches:
+    """The searches of a front, each begun at the best design known by then."""
+
+    def __init__(
+        self,
+        problem: DesignProblem,
+        second: Measure,
+        budget: Budget,
+        folder: Path,
+        resume: bool,
+        tell: Callable[[Progress], Any],
+    ) -> None:
+        self.problem, self.second, self.budget, self.folder = problem, second, budget, folder
+        self.resume, self.tell = resume, tell
+        self.known: list[Evaluation] = []
+        """of all searches; values: first and second objective, then what is constrained"""
+        self.solved: list[tuple[np.ndarray, Result]] = []
+        """the designs of the points, and their solutions"""
+
+    def points(self, count: int) -> tuple[Point, ...]:
+        """From the least first objective to the least second one."""
+        begin, end = self._point(1, None), self._point(count, None, swapped=True)
+        limits = np.linspace(begin.values[1], end.values[1], count)[1:-1].tolist()
+        between = [self._point(number, limit) for number, limit in enumerate(limits, 2)]
+        return (begin, *between, end)
+
+    def _point(self, number: int, limit: float | None, swapped: bool = False) -> Point:
+        """The best design in the first objective for a limit on the second; swapped: in the second."""
+        name = f"point-{number}"
+        problem = limited(self.problem, self.second, limit, swapped)
+        self.tell(Progress(name, 0.0, f"minimising the {in_words(problem.objective)}"))
+        begin = Record(problem, self.budget.method, [_swapped(e, swapped) for e in self.known]).best()
+        near = None
+        if begin is not None:
+            problem = dataclasses.replace(problem, scene=problem.scene_at(begin.design))
+            near = min(self.solved, key=lambda known: float(np.max(np.abs(known[0] - begin.design))))
+        record = Record(problem, self.budget.method, [])
+        journal = Journal(self.folder / name, self.resume)
+        heard = lambda event: self.tell(dataclasses.replace(event, stage=name))  # noqa: E731
+        try:
+            take_over(record, journal, heard)
+            _, stopped = drive(record, self.budget, journal, heard, near)
+            best, result = found_cold(record, None)
+            said = record.to_dict(best=result.final, best_design=best.design, stopped_because=stopped)
+            journal.write(said, record.rows())
+        finally:
+            journal.close()
+        self.tell(Progress(name, 1.0, stopped))
+        self.known += [_swapped(e, swapped) for e in record.evaluations]
+        self.solved.append((best.design, result))
+        first, second = _swapped(best, swapped).values[:2].tolist()
+        violation, count = best.violation(problem), len(record.evaluations)
+        return Point(name, limit, best.design, (first, second), violation, result, count, stopped)
+
+
+def _swapped(e: Evaluation, swapped: bool) -> Evaluation:
+    """An evaluation with its first two measures swapped, or as it is."""
+    if not swapped:
+        return e
+    order = [1, 0, *range(2, len(e.values))]
+    return dataclasses.replace(e, values=e.values[order], gradients=e.gradients[order])
+
+
+def limited(
+    problem: DesignProblem, second: Measure, limit: float | None, swapped: bool = False
+) -> DesignProblem:
+    """The problem with a limit on the second objective, which is measured in any case.
+
+    swapped: the second objective is minimised, and the first one is measured
+    """
+    first, other = (second, problem.objective) if swapped else (problem.objective, second)
+    limits = Constraint(other) if limit is None else Constraint(other, upper=limit)
+    return dataclasses.replace(problem, objective=first, constraints=(limits, *problem.constraints))

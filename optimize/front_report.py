@@ -1,0 +1,117 @@
+"""What a study with two objectives leaves: every design's scene and outputs, the front, and one page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from jaxclamp import Progress, dump_scene
+from jaxclamp.pictures.plots import Plate, png
+from jaxclamp.pictures.plots.style import AXIAL, CIRCUMFERENTIAL, FAINT, Picture, dress, legend
+from jaxclamp.show.export import write_outputs
+from jaxclamp.show.report import document, figure_section, number, section, table
+from optimize.figures import labelled, profile
+from optimize.front import Front
+from optimize.journal import write_bytes, write_whole
+
+
+def write_front(
+    found: Front, folder: Path, title: str, progress: Callable[[Progress], Any] | None = None
+) -> list[Path]:
+    """Outputs of every point in its folder, front.png and report.html; returns the files to open."""
+    tell = progress or (lambda event: None)
+    for number_, point in enumerate(found.points):
+        tell(Progress("writing", number_ / len(found.points), point.folder))
+        write_outputs(point.result, folder / point.folder / "best")
+        write_whole(folder / point.folder / "best" / "scene.toml", dump_scene(point.result.scene))
+    plates = []
+    for plate in plates_of(found):
+        plates.append((plate, png(plate.figure)))
+        write_bytes(folder / f"{plate.name}.png", plates[-1][1])
+    write_whole(folder / "report.html", page(found, title, plates))
+    tell(Progress("writing", 1.0, f"report in {folder}"))
+    return [folder / "report.html", folder / "front.png", folder / "study.json"]
+
+
+def plates_of(found: Front) -> list[Plate]:
+    """The front, and the jaws on it."""
+    front_said = (
+        "Each point is the best design found in the first objective for its limit on the second. Hollow ones "
+        "are beaten by another in both. The start and the reference need not meet the study's constraints."
+    )
+    jaws_said = "Faces of the jaws along the artery, from the least first objective to the least second one."
+    return [
+        Plate("front", "What they cost each other", front_said, plot_front(found)),
+        Plate("profiles", "The jaws", jaws_said, plot_jaws(found)),
+    ]
+
+
+def plot_front(found: Front) -> Picture:
+    """The second objective against the first, of every point, of the start and of the reference."""
+    figure = Picture(6.4, 4.2)
+    axes = figure.add_subplot()
+    on = [p for p in found.points if not found.is_beaten(p)]
+    axes.plot([p.values[0] for p in on], [p.values[1] for p in on], "-", color=AXIAL, linewidth=1.4)
+    for point in found.points:
+        face = "white" if found.is_beaten(point) else AXIAL
+        axes.plot(*point.values, "o", color=AXIAL, markerfacecolor=face, markersize=6)
+        axes.annotate(
+            point.folder, point.values, (6, 4), textcoords="offset points", fontsize=8.0, color=FAINT
+        )
+    for name, values in found.others.items():
+        colour = FAINT if name == "reference" else CIRCUMFERENTIAL
+        axes.plot(*values, "s", color=colour, markersize=6, label=name)
+    x, y = map(labelled, found.objectives)
+    dress(axes, x, y)
+    legend(axes)
+    return figure
+
+
+def plot_jaws(found: Front) -> Picture:
+    """The faces of all jaws on the front, one above the other."""
+    figure = Picture(7.2, 1.3 * len(found.points) + 0.6)
+    for place, point in enumerate(found.points, 1):
+        axes = figure.add_subplot(len(found.points), 1, place)
+        axes.plot(*profile(point.result), color=AXIAL, linewidth=1.6)
+        last = place == len(found.points)
+        dress(axes, "position along the artery (mm)" if last else "", "height (mm)", point.folder)
+    return figure
+
+
+def page(found: Front, title: str, plates: list[tuple[Plate, bytes]]) -> str:
+    """The page of a front."""
+    first, second = map(labelled, found.objectives)
+    rows = [
+        [
+            p.folder,
+            *map(number, p.values),
+            number(p.limit),
+            f"{p.violation:.1%}",
+            f"{p.evaluations} designs, {p.stopped_because}",
+        ]
+        for p in found.points
+    ]
+    rows += [[name, *map(number, values), "–", "–", ""] for name, values in found.others.items()]
+    head = ["", first, second, "limit on the second", "constraints violated by", "search"]
+    design = table(
+        ["variable", *(p.folder for p in found.points)],
+        [
+            [entry.name, *(number(float(p.design[i] / entry.factor)) for p in found.points)]
+            for i, entry in enumerate(found.problem.entries)
+        ],
+    )
+    notice = "" if found.warning is None else f'<div class="notice"><b>{escape(found.warning)}.</b></div>'
+    said = (
+        f"<h1>{escape(title)}</h1><p>{escape(first)} against {escape(second[:1].lower() + second[1:])}.</p>"
+    )
+    return document(
+        title,
+        [
+            said + notice,
+            figure_section(plates),
+            section("Points", table(head, rows)),
+            section("Designs", design),
+        ],
+    )

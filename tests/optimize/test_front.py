@@ -1,0 +1,122 @@
+"""Fronts of two objectives: swept, resumed, drawn."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxclamp as jc
+from jaxclamp.cli import main
+from optimize.front import Front, Point
+from optimize.study_file import load_study
+
+STUDY = """
+title = "Two objectives"
+scene = "human-lad"
+set = ["mesh.circumferential=5", "mesh.axial=8", "mesh.radial=[2, 1]", "stop.occlusion=0.6"]
+max_evaluations = 6
+points = 3
+
+[start]
+jaw = { shape = "spline", half_width_mm = 2.0, slopes = [0.4, 0.8], edge_radius_mm = 1.0 }
+
+[[objectives]]
+measure = "smooth_peak_axial_stress_kPa"
+layer = "media"
+
+[[objectives]]
+measure = "smooth_peak_contact_pressure_kPa"
+
+[[variables]]
+key = "clamp.jaw.slopes"
+lower = 0.0
+upper = 2.0
+"""
+PEAK, PRESSURE = jc.smooth_peak_axial_stress("media"), jc.smooth_peak_contact_pressure()
+
+
+def written(folder: Path, text: str = STUDY) -> Path:
+    path = folder / "study.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("points = 3", "points = 1", "whole number from 2"),
+        ("points = 3", "starts = 2", "starts = 2"),
+        ('measure = "smooth_peak_contact_pressure_kPa"', 'measure = "clamp_force"', "clamp_force_N"),
+        (
+            '[[objectives]]\nmeasure = "smooth_peak_contact_pressure_kPa"',
+            "",
+            "expected two tables, found 1",
+        ),
+        (
+            'measure = "smooth_peak_contact_pressure_kPa"',
+            'measure = "smooth_peak_axial_stress_kPa"\nlayer = "media"',
+            "expected two measures",
+        ),
+        ("points = 3", 'method = "adam"', "takes no constraints"),
+    ],
+)
+def test_a_wrong_front_is_one_sentence_and_exit_code_2(tmp_path, capsys, old, new, said):
+    path = written(tmp_path, STUDY.replace(old, new))
+    assert main(["optimise", str(path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert said in captured.err
+
+
+def test_a_point_is_beaten_by_one_that_is_better_in_both(tmp_path):
+    asked = load_study(written(tmp_path))
+    points = tuple(
+        Point(f"point-{i}", None, asked.problem.start, values, 0.0, None, 1, "")  # type: ignore[arg-type]
+        for i, values in enumerate([(1.0, 5.0), (2.0, 3.0), (2.5, 3.0), (4.0, 1.0)], 1)
+    )
+    found = Front(asked.problem, PRESSURE, points, {}, 0.0)
+    assert [found.is_beaten(p) for p in points] == [False, False, True, False]
+
+
+@pytest.mark.slow
+def test_a_front_is_swept_resumed_and_drawn(tmp_path, capsys):
+    out, path = tmp_path / "out", written(tmp_path)
+    command = ["optimise", str(path), "--out", str(out), "--quiet", "--json"]
+    assert main(command) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == json.loads((out / "study.json").read_text())
+    first, second = np.array([p["objectives"] for p in found["front"]]).T
+    assert [p["folder"] for p in found["front"]] == ["point-1", "point-2", "point-3"]
+    assert first[0] == pytest.approx(min(first), rel=1e-6)
+    assert second[-1] == pytest.approx(min(second), rel=1e-6)
+    middle = found["front"][1]
+    assert middle["limit"] == pytest.approx(0.5 * (second[0] + second[-1]))
+    start = found["start"]["objectives"]
+    assert first[0] < start[0]
+    assert second[-1] < start[1]
+    assert set(found) >= {"start", "reference", "design", "versions"}
+    for name in ("report.html", "front.png", "point-2/best/report.html"):
+        assert (out / name).stat().st_size > 1000
+    best = jc.clamp(jc.load_scene(out / "point-3" / "best" / "scene.toml"))
+    assert best.measure(PRESSURE) == pytest.approx(second[-1], rel=1e-5)
+    assert best.measure(PEAK) == pytest.approx(first[-1], rel=1e-5)
+
+    # a second study there needs --resume; one that was cut off goes on with what it has
+    assert main(command) == 2
+    assert "--resume" in capsys.readouterr().err
+    rows = json.loads((out / "point-3" / "study.json").read_text())["iterations"]
+    (out / "study.json").unlink()
+    (out / "point-2" / "study.json").unlink()
+    assert main([*command, "--resume"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert json.loads((out / "point-3" / "study.json").read_text())["iterations"] == rows
+    assert again["front"][0]["objectives"] == pytest.approx(found["front"][0]["objectives"], rel=1e-9)
+    assert again["front"][1]["objectives"] == pytest.approx(middle["objectives"], rel=1e-6)
+
+    # a study of one objective is not taken for a front
+    (out / "study.json").write_text('{"fingerprint": "a"}', encoding="utf-8")
+    assert main([*command, "--resume"]) == 2
+    assert "of one objective" in capsys.readouterr().err
