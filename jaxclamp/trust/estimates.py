@@ -24,6 +24,7 @@ from jaxclamp.core.failures import EquilibriumError, Singular
 from jaxclamp.observe.figures import FIGURES, WHOLE
 from jaxclamp.scenes.address import get, replace
 from jaxclamp.scenes.scene import MeshSettings, Scene
+from jaxclamp.solve.branch import ANOTHER, FOLLOWED
 from jaxclamp.solve.clamping import clamp, inflate
 from jaxclamp.solve.results import Result
 from jaxclamp.solve.warm import predicted
@@ -32,6 +33,8 @@ CHANGE = 1e-3
 """relative change of a penalty for its derivative"""
 COARSENINGS = (1.3, 2.0)
 """elements of the scene over elements of its twin, per direction"""
+SAME = 1e-4
+"""how far two states of one equilibrium are apart at most, as part of the lumen's width"""
 SOURCES = ("discretisation", "bulk", "contact_stiffness", "contact_smoothing")
 
 Errors = dict[str, dict[str, float | None]]
@@ -70,9 +73,13 @@ def coarser(mesh: MeshSettings) -> tuple[MeshSettings, float]:
 
 def estimate(result: Result) -> Errors:
     """Errors by figure: `value`, `error` (None if it is not known) and the four signed sources."""
+    return _estimate(result, coarser_twin(result))
+
+
+def _estimate(result: Result, twin: Result | None) -> Errors:
     values = figures(result)
     sources = {
-        "discretisation": _from_the_mesh(result, values),
+        "discretisation": _from_the_mesh(result, twin, values),
         "bulk": _from_a_penalty(result, values, bulk_paths(result.scene), -1.0),
         "contact_stiffness": _from_a_penalty(result, values, ("contact.stiffness",), -1.0),
         "contact_smoothing": _from_a_penalty(result, values, ("contact.smoothing",), 1.0),
@@ -85,8 +92,42 @@ def estimate(result: Result) -> Errors:
 
 
 def with_errors(result: Result) -> Result:
-    """The result with its errors estimated: some iterations on a coarser twin, a few linear solves."""
-    return dataclasses.replace(result, errors=estimate(result))
+    """The result with its errors estimated: some iterations on a coarser twin, a few linear solves.
+
+    An answer that was followed from a neighbour's is held against the closing path, on the coarser twin.
+    """
+    twin = coarser_twin(result)
+    solver = result.solver | {"branch": _confirmed(result, twin)}
+    return dataclasses.replace(result, errors=_estimate(result, twin), solver=solver)
+
+
+def coarser_twin(result: Result) -> Result | None:
+    """The scene on a coarser mesh, solved from the result; None if it has no equilibrium, or no such mesh."""
+    if any(np.ndim(leaf) > 1 for leaf in jax.tree_util.tree_leaves(result.scene.artery)):
+        return None  # constants of each point belong to one mesh
+    scene = dataclasses.replace(result.scene, mesh=coarser(result.scene.mesh)[0])
+    solve: Callable[..., Result] = clamp if result.states[-1].stage == "clamping" else inflate
+    try:
+        return solve(scene, guess=result)
+    except EquilibriumError:
+        return None
+
+
+def _confirmed(result: Result, twin: Result | None) -> str | None:
+    """The result's branch; of a followed one, whether its twin is where the twin's own closing leads."""
+    branch: str | None = result.solver["branch"]
+    if branch != FOLLOWED or twin is None or twin.solver["branch"] != FOLLOWED:
+        return branch
+    try:
+        closed = clamp(twin.scene)
+    except EquilibriumError:
+        return branch
+    apart = float(np.max(np.abs(np.asarray(closed.states[-1].state.x - twin.states[-1].state.x))))
+    if apart <= SAME * float(twin.final["lumen_width_mm"]):
+        return f"{FOLLOWED}; on a coarser mesh, closing anew leads to the same"
+    forces = [f"{r.final['clamp_force_N']:.4g} N" for r in (closed, twin)]
+    said = "on a coarser mesh, closing anew leads to a jaw force of {}, following this one to {}"
+    return f"{ANOTHER}: {said.format(*forces)}"
 
 
 def bulk_paths(scene: Scene) -> tuple[str, ...]:
@@ -99,18 +140,12 @@ def _total(parts: list[float | None]) -> float | None:
     return sum(known) if len(known) == len(parts) else None
 
 
-def _from_the_mesh(result: Result, values: dict[str, float]) -> dict[str, float | None]:
-    """Figure less the figure on an infinitely fine mesh; None where the twin has no equilibrium."""
-    if any(np.ndim(leaf) > 1 for leaf in jax.tree_util.tree_leaves(result.scene.artery)):
-        return dict.fromkeys(values)  # constants of each point belong to one mesh
-    mesh, ratio = coarser(result.scene.mesh)
-    scene = dataclasses.replace(result.scene, mesh=mesh)
-    solve: Callable[..., Result] = clamp if result.states[-1].stage == "clamping" else inflate
-    try:
-        twin = figures(solve(scene, guess=result))
-    except EquilibriumError:
+def _from_the_mesh(result: Result, twin: Result | None, values: dict[str, float]) -> dict[str, float | None]:
+    """Figure less the figure on an infinitely fine mesh; None without a twin."""
+    if twin is None:
         return dict.fromkeys(values)
-    return {key: (value - twin[key]) / (1.0 - ratio ** _order(key)) for key, value in values.items()}
+    ratio, coarse = coarser(result.scene.mesh)[1], figures(twin)
+    return {key: (value - coarse[key]) / (1.0 - ratio ** _order(key)) for key, value in values.items()}
 
 
 def _order(key: str) -> float:
