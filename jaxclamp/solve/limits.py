@@ -15,12 +15,12 @@ def walls_meet(values: Record, lumen_radius: float) -> bool:
     return bool(values["lumen_overlap_mm"] > ROUNDING * lumen_radius)
 
 
-def sinking(values: Record, outer_radius: float, thickness: float) -> str | None:
-    """What sinks into what, and what to do; None if nothing does. Both lengths in the body, mm."""
+def sinking(values: Record, thickness: float) -> str | None:
+    """What sinks into what, and what to do; None if nothing does. thickness: of the wall in the body, mm."""
     if values["max_penetration_mm"] > LARGEST_SINKING * thickness:
         return "the jaws sink into the wall: raise contact.stiffness_kPa_per_mm"
     if values["lumen_overlap_mm"] > LARGEST_SINKING * thickness:
         return "the inner walls sink into each other: raise contact.stiffness_kPa_per_mm"
-    if outer_radius - values["jaw_height_mm"] > LARGEST_SINKING * thickness:
+    if values["outer_radius_mm"] - values["jaw_height_mm"] > LARGEST_SINKING * thickness:
         return "the jaw sinks in between the contact points of the wall: refine the mesh under it"
     return None

@@ -133,10 +133,9 @@ class Clamping:
 
     def check(self, values: Record) -> None:
         """Refuse a closing state that the model does not cover. Raises EquilibriumError, TermMissing."""
-        thickness = self.outer_radius - self.lumen_radius
         if walls_meet(values, self.lumen_radius) and not self.system.potential.of(INTIMA):
             raise TermMissing(f"opposite inner walls meet before the stop: the term '{INTIMA}' is needed")
-        reason = sinking(values, self.outer_radius, thickness)
+        reason = sinking(values, self.outer_radius - self.lumen_radius)
         if reason is not None:
             raise self.error("clamping", self.states[-1].equilibrium, NotConverged(reason))
 
