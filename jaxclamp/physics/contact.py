@@ -12,9 +12,9 @@ from jaxclamp.core.tensors import half_square
 class Contact:
     """Smoothed penalty between the outer wall and a rigid jaw."""
 
-    stiffness: Array = quantity("kPa_per_mm", 1e-3, 1e12, default=2000.0)
+    stiffness: Array = quantity("kPa_per_mm", 1e-3, 1e12)
     """contact pressure per penetration"""
-    smoothing: Array = quantity("mm", 1e-9, 10.0, default=0.01)
+    smoothing: Array = quantity("mm", 1e-9, 10.0)
     """the pressure sets in at this gap, and is exactly stiffness * penetration below minus it"""
 
     def energy(self, gap: Array) -> Array:

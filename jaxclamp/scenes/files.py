@@ -2,8 +2,8 @@
 
 The records of `scenes.scene` are the schema (see `scenes.schema`); this module reads and writes the
 files, and puts together what the records cannot say alone: presets named in place of a table,
-overrides, a mesh chosen by fidelity, and the checks that need more than one key. Whatever is wrong
-ends as a `SceneError`, one sentence.
+overrides, a mesh chosen by fidelity, contact that fits the wall, and the checks that need more than
+one key. Whatever is wrong ends as a `SceneError`, one sentence.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from jaxclamp.physics.jaws import Jaw
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.checks import check
 from jaxclamp.scenes.fidelity import COUNTS, FIDELITIES, mesh_for
+from jaxclamp.scenes.fitting import fitting_contact
 from jaxclamp.scenes.overrides import apply_override
 from jaxclamp.scenes.presets import preset
 from jaxclamp.scenes.scene import Artery, Scene
@@ -172,10 +173,11 @@ def _scene(table: dict[str, Any], fidelity: str) -> Scene:
             table["stop"]["closed"],
             "another stop: complete closure is not available yet; use an occlusion, such as 0.925",
         )
-    mesh = table.get("mesh", {})
-    if "artery" in table and isinstance(mesh, dict):
+    mesh, contact = table.get("mesh", {}), table.get("contact", {})
+    if "artery" in table and isinstance(mesh, dict) and isinstance(contact, dict):
         artery = schema.read(Artery, table["artery"], "artery")
         table["mesh"] = schema.table(mesh_for(fidelity, artery)) | mesh
+        table["contact"] = schema.table(fitting_contact(artery)) | contact
     scene = schema.read(Scene, table)
     check(scene)
     return scene

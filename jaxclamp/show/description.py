@@ -9,6 +9,7 @@ import numpy as np
 from jaxclamp.fem.symmetry import symmetry_of
 from jaxclamp.fem.tube import axial_fractions, build_tube, end_height
 from jaxclamp.potential.terms import needed
+from jaxclamp.scenes.fitting import fitting_contact
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.linear_solvers import available
 from jaxclamp.solve.memory import predicted_MB, unknowns_of
@@ -41,12 +42,23 @@ def describe(scene: Scene) -> dict[str, Any]:
         "elements": mesh.n_cells,
         "unknowns": unknowns,
         "stop": scene.stop.kind,
+        "contact": contact(scene),
         "continuation": solver.continuation,
         "linear_solver": available(unknowns)[0] if solver.linear_solver == "auto" else solver.linear_solver,
         "predicted_seconds": _rounded(seconds),
         "predicted_memory_MB": _rounded(predicted_MB(unknowns)),
         "warnings": warnings(scene),
     }
+
+
+def contact(scene: Scene) -> str:
+    """The contact law in words, beside the one that fits the wall (`docs/contact.md`)."""
+    fits, stated = fitting_contact(scene.artery), scene.contact
+    law, other = (
+        f"{float(c.stiffness):.4g} kPa/mm, smoothed over {float(c.smoothing):.3g} mm" for c in (stated, fits)
+    )
+    rule = "(c + p) over 1 % of the wall's thickness, smoothed over 1 % of it"
+    return f"{law}: fits the wall, {rule}" if stated == fits else f"{law}, as stated (by the wall: {other})"
 
 
 def _rounded(estimate: float) -> float:

@@ -268,6 +268,13 @@ def checks(result: Result) -> list[tuple[str, str, str, bool]]:
         ("largest volume ratio at a point", "", final.get("J_max"), "below 2", lambda v: v < 2.0),
         ("negative pivots of the tangent", "", solver["negative_pivots"], "0: stable", lambda v: v == 0),
         ("stability lost and regained on the way", "", solver["snapped"], "no", lambda v: not v),
+        (
+            "which equilibrium it is",
+            "",
+            solver["branch"],
+            "on the path of closing jaws",
+            lambda v: not v.startswith("another"),
+        ),
     ]
     return [
         (what, number(value, key), expected, bool(fine(value)))

@@ -15,11 +15,12 @@ from jaxclamp.core.progress import Progress, Tell, teller
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.files import require_computable
 from jaxclamp.scenes.scene import Scene
+from jaxclamp.solve.branch import branch_of
 from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.memory import require_memory, unknowns_of
 from jaxclamp.solve.results import Result, work_balance
 from jaxclamp.solve.stages import Clamping
-from jaxclamp.solve.warm import on_mesh_of, solve_warm
+from jaxclamp.solve.warm import branch_from, on_mesh_of, solve_warm
 
 
 def clamp(
@@ -104,7 +105,9 @@ def _from_neighbour(
     clamping = Clamping(model, tell, solver, every_term=guess.every_term)
     try:
         if solve_warm(clamping, warm, to_stop, carried_over):
-            return _result(clamping, None, start), clamping
+            last, closed = clamping.states[-1], guess.states[-1].stage == "clamping"
+            followed = branch_from(guess, model.scene, last.equilibrium) if to_stop and closed else None
+            return _result(clamping, None, start, followed), clamping
     except TermMissing:
         pass
     except EquilibriumError as error:
@@ -141,8 +144,13 @@ def peak_memory_MB() -> float | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def _result(clamping: Clamping, failure: EquilibriumError | None, start: float) -> Result:
+def _result(
+    clamping: Clamping, failure: EquilibriumError | None, start: float, branch: str | None = None
+) -> Result:
+    """What a clamping came to; branch: of an answer that was followed from a neighbour's."""
     system, states = clamping.system, tuple(clamping.states)
+    closing = [kept.equilibrium for kept in states if kept.stage == "clamping"]
+    branch = branch or (branch_of(closing) if closing else None)
     last = states[-1].values if states else {}
     solver = {
         "linear_solver": system.solver.name,
@@ -154,6 +162,7 @@ def _result(clamping: Clamping, failure: EquilibriumError | None, start: float) 
         "work_balance_error": work_balance([kept for kept in states if kept.stage == "clamping"]),
         "snapped": any(kept.equilibrium.snapped for kept in states),
         "negative_pivots": states[-1].equilibrium.negative_pivots if states else None,
+        "branch": branch,
     }
     cost = {
         "wall_s": time.perf_counter() - start,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxclamp.core.failures import NotConverged
 from jaxclamp.potential.energy import State
-from jaxclamp.solve.newton import Equilibrium, Path, System, newton
+from jaxclamp.solve.newton import Equilibrium, Path, Step, System, newton
 
 EASY_ITERATIONS = 5
 """a step that converged in so many iterations lets the next one grow"""
@@ -32,12 +32,13 @@ def follow(
     on_step: Callable[[float, Equilibrium], None],
     reached: Callable[[Equilibrium], bool] = lambda equilibrium: False,
     first_step: float = FIRST_STEP,
+    accept: Callable[[Step, Equilibrium, Equilibrium], None] = lambda step, before, found: None,
 ) -> tuple[float, Equilibrium, NotConverged | None]:
     """Walk a path from its parameter 0 towards 1, as far as Newton goes.
 
     Returns the parameter reached, its equilibrium, and None or the last failure.
     end_height: of the artery's ends at a stretch, mm; on_step is called at every converged state, and
-    `reached` may end the walk there.
+    `reached` may end the walk there; `accept` may refuse what was found from the equilibrium before.
     """
     s, equilibrium, step = 0.0, start, first_step
     failure: NotConverged | None = None
@@ -51,6 +52,7 @@ def follow(
         guess = stretched(equilibrium.state, end_height(wanted.axial_stretch))
         try:
             found = newton(system, guess, wanted, equilibrium)
+            accept(wanted, equilibrium, found)
         except NotConverged as error:
             failure, step = error, 0.4 * (target - s)
             continue

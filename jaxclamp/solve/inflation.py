@@ -1,4 +1,4 @@
-"""The tube under stretch and pressure as one scalar problem: a start for Newton's method.
+"""The round tube, closed, stretched and inflated, as one scalar problem: a start for Newton's method.
 
 Without the clamp the artery stays a round tube. If its wall keeps its volume, one number says all,
 the inner radius; the radius of least potential lies within the compressibility and the mesh error
@@ -7,14 +7,19 @@ of the finite-element answer, so that Newton needs three or four iterations inst
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxclamp.fem.elements import gauss
-from jaxclamp.fem.tube import sector_share
-from jaxclamp.scenes.scene import Artery
+from jaxclamp.fem.grid import Mesh
+from jaxclamp.fem.tube import closed_positions, closed_radii, sector_share
+from jaxclamp.potential.energy import State, with_equilibrium_pressure
+from jaxclamp.potential.terms import Potential
+from jaxclamp.scenes.scene import Artery, MeshSettings
 
 POINTS = 6
 """Gauss points through each layer"""
@@ -66,6 +71,26 @@ def inflated_radius(artery: Artery, load_free_radius: float) -> float | None:
     around = slice(nearest - 1, nearest + 2)
     a, b, _ = np.polyfit(radii[around] - radii[nearest], levels[around], 2)
     return float(radii[nearest] - b / (2.0 * a)) if a > 0.0 else float(radii[nearest])
+
+
+def closed_tube(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
+    """Load-free positions of the incompressible round tube that the sectors close to, mm, (n_nodes, 3)."""
+    guess = closed_positions(mesh, settings, artery)
+    radius = float(closed_radii(mesh, artery)[0])
+    alone = dataclasses.replace(artery, pressure=jnp.asarray(0.0), axial_stretch=jnp.asarray(1.0))
+    found = inflated_radius(alone, radius)
+    return guess if found is None else inflated_positions(guess, alone, radius, found)
+
+
+def inflated_tube(
+    potential: Potential, artery: Artery, load_free: State, load_free_radius: float
+) -> State | None:
+    """The artery as an incompressible round tube at its stretch and pressure; None if there is none."""
+    radius = inflated_radius(artery, load_free_radius)
+    if radius is None:
+        return None
+    x = inflated_positions(load_free.x, artery, load_free_radius, radius)
+    return with_equilibrium_pressure(potential, x, load_free.q)
 
 
 @jax.jit

@@ -19,6 +19,7 @@ from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
 from jaxclamp.scenes.scene import Scene
+from jaxclamp.solve.branch import work
 from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.newton import Equilibrium
 
@@ -238,18 +239,9 @@ def versions() -> dict[str, str]:
 
 
 def work_balance(closing: list[Kept]) -> float | None:
-    """Work of the jaws against the change of total energy over the closing, relative.
-
-    Between two states the force is integrated over the travel with its slopes at both ends
-    (Hermite, fourth order): W = h/2 (F0 + F1) + h**2/12 (F0' - F1').
-    """
+    """Work of the jaws (`branch.work`) against the change of total energy over the closing, relative."""
     if len(closing) < 3:
         return None
-    work = 0.0
-    for a, b in pairwise(closing):
-        down = float(a.state.jaw_height) - float(b.state.jaw_height)
-        forces = [float(k.equilibrium.lin.jaw_force) for k in (a, b)]
-        slopes = [-k.equilibrium.force_slope for k in (a, b)]
-        work += down / 2.0 * sum(forces) + down**2 / 12.0 * (slopes[0] - slopes[1])
+    done = sum(work(a.equilibrium, b.equilibrium) for a, b in pairwise(closing))
     change = float(closing[-1].equilibrium.lin.energy) - float(closing[0].equilibrium.lin.energy)
-    return abs(work - change) / max(abs(change), 1e-12)
+    return abs(done - change) / max(abs(change), 1e-12)

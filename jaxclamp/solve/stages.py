@@ -14,7 +14,6 @@ from jaxclamp.core.failures import EquilibriumError, Exhausted, NotConverged, Te
 from jaxclamp.core.progress import Progress, Tell
 from jaxclamp.core.records import UNIT_FACTOR
 from jaxclamp.fem.landmarks import lumen_height
-from jaxclamp.fem.tube import closed_positions
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import Record, read_figures
 from jaxclamp.observe.stops import OcclusionStop
@@ -24,9 +23,11 @@ from jaxclamp.potential.energy import State, with_equilibrium_pressure
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import INTIMA
 from jaxclamp.scenes.scene import Stop
+from jaxclamp.solve.branch import KINK, gain, require_same_path
 from jaxclamp.solve.descent import descend_eased, ease_of
 from jaxclamp.solve.follow import follow, stretched
-from jaxclamp.solve.inflation import inflated_positions, inflated_radius
+from jaxclamp.solve.inflation import closed_tube, inflated_radius, inflated_tube
+from jaxclamp.solve.limits import sinking, walls_meet
 from jaxclamp.solve.linear_solvers import LinearSolver
 from jaxclamp.solve.newton import Equilibrium, Path, Step, System, bordered_step, newton
 from jaxclamp.solve.results import Kept
@@ -42,10 +43,6 @@ NEARLY_THERE = 0.95
 """share of the way to the stop up to which closing goes in steps of travel, if it is to"""
 AT_THE_STOP = 1e-8
 """distance of the jaw from where the stop's condition holds, as part of the lumen radius"""
-ROUNDING = 1e-9
-"""overlap of opposite inner walls, as part of the lumen radius, that is none: nodes on the fold lie at 0"""
-LARGEST_SINKING = 0.5
-"""jaw and wall, or opposite inner walls, may overlap by this part of the wall's thickness"""
 RESCUE_MOVE = 0.02
 """jaw move of a descent, as part of the outer radius"""
 MAX_RESCUES = 60
@@ -137,31 +134,32 @@ class Clamping:
 
     def check(self, values: Record) -> None:
         """Refuse a closing state that the model does not cover. Raises EquilibriumError, TermMissing."""
-        met = values["lumen_overlap_mm"] > ROUNDING * self.lumen_radius
-        if met and not self.system.potential.of(INTIMA):
+        if walls_meet(values, self.lumen_radius) and not self.system.potential.of(INTIMA):
             raise TermMissing(f"opposite inner walls meet before the stop: the term '{INTIMA}' is needed")
-        reason, thickness = None, self.outer_radius - self.lumen_radius
-        if values["outer_radius_mm"] - values["jaw_height_mm"] > LARGEST_SINKING * thickness:
-            reason = "the jaw sinks in between the contact points of the wall: refine the mesh under it"
-        if values["lumen_overlap_mm"] > LARGEST_SINKING * thickness:
-            reason = "the inner walls sink into each other: raise contact.stiffness_kPa_per_mm"
-        if values["max_penetration_mm"] > LARGEST_SINKING * thickness:
-            reason = "the jaws sink into the wall: raise contact.stiffness_kPa_per_mm"
+        reason = sinking(values, self.outer_radius - self.lumen_radius)
         if reason is not None:
             raise self.error("clamping", self.states[-1].equilibrium, NotConverged(reason))
 
     # --- the three stages -----------------------------------------------------------------------------
 
     def load_free(self, guess: State | None = None) -> Equilibrium:
-        """Close the open sectors: no pressure, no stretch, the jaw far away."""
+        """Close the open sectors: no pressure, no stretch, the jaw far away.
+
+        The round tube counts even if it is not stable: unloaded, a wall may wrinkle that is smooth in the
+        body.
+        """
         self.tell(Progress("load-free", 0.0, "closing the open sectors"))
         scene, model = self.model.scene, self.model
         self.use_terms(closing=False)
-        x = closed_positions(model.mesh, scene.mesh, scene.artery) if guess is None else guess.x
+        x = closed_tube(model.mesh, scene.mesh, scene.artery) if guess is None else guess.x
         self.system.length = float(jnp.max(x[:, 1]))
         far = jnp.full(len(RIGID), self.far, float)
         start = with_equilibrium_pressure(model.potential, x, far) if guess is None else guess
-        equilibrium = self.solve_or_descend("load-free", start, Step(Held(self.far), 0.0, 1.0), "no load")
+        step = Step(Held(self.far), 0.0, 1.0)
+        try:
+            equilibrium = newton(self.system, start, step)
+        except NotConverged:
+            equilibrium = self.solve_or_descend("load-free", start, step, "no load")
         self.system.length = 0.5 * float(lumen_height(equilibrium.state.x, model.marks))
         self.keep("load-free", equilibrium, 1.0, f"lumen radius {self.system.length:.3f} mm")
         return equilibrium
@@ -176,7 +174,7 @@ class Clamping:
         )
         equilibrium = None
         if guess is None:
-            guess = self.inflated(load_free)
+            guess = inflated_tube(self.model.potential, artery, load_free.state, self.system.length)
         else:
             guess = stretched(guess, self.model.end_height(stretch))
         if guess is not None:
@@ -190,15 +188,6 @@ class Clamping:
         radius = 0.5 * float(lumen_height(equilibrium.state.x, self.model.marks))
         self.keep("physiological", equilibrium, 1.0, f"lumen radius {radius:.3f} mm")
         return equilibrium
-
-    def inflated(self, load_free: Equilibrium) -> State | None:
-        """The artery as an incompressible round tube at its stretch and pressure; None if there is none."""
-        artery, radius_before = self.model.scene.artery, self.system.length
-        radius = inflated_radius(artery, radius_before)
-        if radius is None:
-            return None
-        x = inflated_positions(load_free.state.x, artery, radius_before, radius)
-        return with_equilibrium_pressure(self.model.potential, x, load_free.state.q)
 
     def close(self, in_body: Equilibrium) -> Equilibrium:
         """Move the jaw on until the stop."""
@@ -337,13 +326,15 @@ class Clamping:
     ) -> Equilibrium:
         """Follow a path; where Newton fails, take one step downhill at a held jaw and return."""
         options: dict[str, Any] = {} if first_step is None else {"first_step": first_step}
+        if stage == "clamping":
+            options["accept"] = require_same_path
         _, equilibrium, failure = follow(
             self.system, start, path, self.model.end_height, say, reached, **options
         )
         if failure is None:
             return equilibrium
         if stage != "clamping":
-            if self.inflated(start) is None:
+            if inflated_radius(self.model.scene.artery, self.system.length) is None:
                 failure = NotConverged("the wall does not carry the pressure: it balloons")
             raise self.error(stage, equilibrium, failure)
         return self.rescue(equilibrium, failure, say)
@@ -354,18 +345,25 @@ class Clamping:
         """One step downhill from where the jaw was lowest: a path may come back up and be walked for ever."""
         closed = [last, *(kept.equilibrium for kept in self.states if kept.stage == "clamping")]
         lowest = min(closed, key=lambda e: float(e.state.jaw_height))
-        move = RESCUE_MOVE * self.outer_radius
+        move, elsewhere = RESCUE_MOVE * self.outer_radius, None
         while move > 1e-3 * RESCUE_MOVE * self.outer_radius:
             step = self.step(Held(float(lowest.state.jaw_height) - move))
             try:
-                found = self.settle(lowest.state, step)
+                found = self.settle(lowest.state, step, lowest)
             except Exhausted:  # what failed before is the cause
                 break
             except NotConverged as error:
                 failure, move = error, 0.5 * move
                 continue
-            say(math.nan, found)
-            return found
+            gained = gain(lowest, found)
+            if gained <= KINK:
+                found = dataclasses.replace(found, snapped=gained < -KINK)
+                say(math.nan, found)
+                return found
+            elsewhere, move = elsewhere or found, 0.5 * move
+        if elsewhere is not None:
+            say(math.nan, elsewhere)
+            return elsewhere
         if self.share(lowest.state) > 1.0 + 1e-6:
             failure = NotConverged("the lumen snaps shut past the stop, and no way back to it was found")
         raise self.error("clamping", last, failure)
@@ -377,10 +375,15 @@ class Clamping:
         except NotConverged as error:
             raise EquilibriumError(stage, f"at {load}", error, ADVICE[stage]) from error
 
-    def settle(self, start: State, step: Step) -> Equilibrium:
-        """A stable equilibrium at a held jaw: by Newton's method, or else downhill. Raises NotConverged."""
+    def settle(self, start: State, step: Step, before: Equilibrium | None = None) -> Equilibrium:
+        """A stable equilibrium at a held jaw: by Newton's method, or else downhill. Raises NotConverged.
+
+        before: the equilibrium that Newton's method is to stay on the path of
+        """
         with contextlib.suppress(NotConverged):
             found = newton(self.system, start, step)
+            if before is not None:
+                require_same_path(step, before, found)
             if not found.negative_pivots:
                 return found
         return descend_eased(self.system, start, step, ease_of(self.model.scene))

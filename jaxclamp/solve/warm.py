@@ -14,6 +14,7 @@ from jaxclamp.fem.symmetry import symmetry_of
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model, build_model, same_kind
 from jaxclamp.scenes.scene import Scene
+from jaxclamp.solve.branch import ANOTHER, CLOSING_PATH, FOLLOWED, require_same_path
 from jaxclamp.solve.follow import stretched
 from jaxclamp.solve.newton import Equilibrium, Step, newton, predict
 from jaxclamp.solve.results import Kept, Result
@@ -81,6 +82,25 @@ def same_artery(a: Scene, b: Scene) -> bool:
     return same and b.solver.tolerance <= a.solver.tolerance
 
 
+def same_but_for_the_stop(a: Scene, b: Scene) -> bool:
+    """True if the same clamp closes the same artery, to the same or another stop."""
+    return same_artery(a, b) and equal(a.clamp, b.clamp) and equal(a.contact, b.contact)
+
+
+def branch_from(guess: Result, target: Scene, found: Equilibrium) -> str:
+    """What an equilibrium followed from a neighbour's is; see `solve.branch`.
+
+    Only with the same clamp on the same artery is it known to be on the same closing path.
+    """
+    before, last = str(guess.solver["branch"]), guess.states[-1].equilibrium
+    if before.startswith(ANOTHER):
+        return f"{ANOTHER}: followed from a neighbour that is one"
+    if before == FOLLOWED or not same_but_for_the_stop(target, guess.scene) or found.negative_pivots:
+        return FOLLOWED
+    on = float(found.state.jaw_height) <= float(last.state.jaw_height)
+    return before if on or before == CLOSING_PATH else FOLLOWED
+
+
 def equal(a: Any, b: Any) -> bool:
     """True if two records have the same static choices and the same floats."""
     floats = zip(*map(jax.tree_util.tree_leaves, (a, b)), strict=True)
@@ -99,6 +119,7 @@ def _follow_to_stop(
     target, body = clamping.model, clamping.body
     assert guess.physiological is not None
     before, reached, step = guess.physiological.state, 0.0, 1.0
+    further = not carried_over and same_but_for_the_stop(target.scene, guess.scene)
     while reached < 1.0:
         t = min(1.0, reached + step)
         clamping.use(target if t == 1.0 else build_model(between(guess.scene, target.scene, t), target))
@@ -107,8 +128,10 @@ def _follow_to_stop(
         near = dataclasses.replace(last, state=stretched(last.state, clamping.model.end_height(stretch)))
         at_stop = clamping.at_stop(near.state)
         try:
-            last = newton(clamping.system, predict(clamping.system, near, at_stop), at_stop)
-            reached = t
+            found = newton(clamping.system, predict(clamping.system, near, at_stop), at_stop)
+            if further:
+                require_same_path(at_stop, last, found)
+            last, reached = found, t
         except NotConverged:
             if carried_over:
                 clamping.use(build_model(guess.scene, target))

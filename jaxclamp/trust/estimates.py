@@ -33,6 +33,7 @@ from jaxclamp.observe.figures import FIGURES, POINT, WHOLE
 from jaxclamp.observe.measures import Measure
 from jaxclamp.scenes.address import get, replace
 from jaxclamp.scenes.scene import MeshSettings, Scene
+from jaxclamp.solve.branch import ANOTHER, FOLLOWED
 from jaxclamp.solve.clamping import clamp, inflate
 from jaxclamp.solve.results import Result
 from jaxclamp.solve.warm import predicted
@@ -41,6 +42,8 @@ CHANGE = 1e-3
 """relative change of a penalty for its derivative"""
 COARSENINGS = (1.3, 2.0)
 """elements of the scene over elements of its twin, per direction"""
+SAME = 1e-4
+"""how far two states of one equilibrium are apart at most, as part of the lumen's width"""
 SOURCES = ("discretisation", "bulk", "contact_stiffness", "contact_smoothing")
 
 Errors = dict[str, dict[str, float | None]]
@@ -201,8 +204,30 @@ def estimate(result: Result, near: Neighbours | None = None) -> Errors:
 
 
 def with_errors(result: Result, near: Neighbours | None = None) -> Result:
-    """The result with its errors estimated, from its neighbours if they are at hand."""
-    return dataclasses.replace(result, errors=estimate(result, near))
+    """The result with its errors estimated, from its neighbours if they are at hand.
+
+    An answer that was followed from another result's is held against the closing path, on the coarser twin.
+    """
+    near = near or neighbours(result)
+    solver = result.solver | {"branch": _confirmed(result, near.twin)}
+    return dataclasses.replace(result, errors=estimate(result, near), solver=solver)
+
+
+def _confirmed(result: Result, twin: Result | None) -> str | None:
+    """The result's branch; of a followed one, whether its twin is where the twin's own closing leads."""
+    branch: str | None = result.solver["branch"]
+    if branch != FOLLOWED or twin is None or twin.solver["branch"] != FOLLOWED:
+        return branch
+    try:
+        closed = clamp(twin.scene)
+    except EquilibriumError:
+        return branch
+    apart = float(np.max(np.abs(np.asarray(closed.states[-1].state.x - twin.states[-1].state.x))))
+    if apart <= SAME * float(twin.final["lumen_width_mm"]):
+        return f"{FOLLOWED}; on a coarser mesh, closing anew leads to the same"
+    forces = [f"{r.final['clamp_force_N']:.4g} N" for r in (closed, twin)]
+    said = "on a coarser mesh, closing anew leads to a jaw force of {}, following this one to {}"
+    return f"{ANOTHER}: {said.format(*forces)}"
 
 
 def bulk_paths(scene: Scene) -> tuple[str, ...]:

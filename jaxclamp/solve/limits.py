@@ -1,0 +1,26 @@
+"""Where a clamped state is no longer what the model means: bodies that sink into each other."""
+
+from __future__ import annotations
+
+from jaxclamp.observe.figures import Record
+
+ROUNDING = 1e-9
+"""overlap of opposite inner walls, as part of the lumen radius, that is none: nodes on the fold lie at 0"""
+LARGEST_SINKING = 0.5
+"""jaw and wall, or opposite inner walls, may overlap by this part of the wall's thickness"""
+
+
+def walls_meet(values: Record, lumen_radius: float) -> bool:
+    """True if opposite inner walls overlap; lumen_radius: in the body, mm."""
+    return bool(values["lumen_overlap_mm"] > ROUNDING * lumen_radius)
+
+
+def sinking(values: Record, thickness: float) -> str | None:
+    """What sinks into what, and what to do; None if nothing does. thickness: of the wall in the body, mm."""
+    if values["max_penetration_mm"] > LARGEST_SINKING * thickness:
+        return "the jaws sink into the wall: raise contact.stiffness_kPa_per_mm"
+    if values["lumen_overlap_mm"] > LARGEST_SINKING * thickness:
+        return "the inner walls sink into each other: raise contact.stiffness_kPa_per_mm"
+    if values["outer_radius_mm"] - values["jaw_height_mm"] > LARGEST_SINKING * thickness:
+        return "the jaw sinks in between the contact points of the wall: refine the mesh under it"
+    return None
