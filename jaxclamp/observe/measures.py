@@ -1,16 +1,14 @@
-"""What is minimised, constrained or differentiated: one number of the equilibria of a scene.
+"""The measures that ship: what is minimised, constrained or differentiated.
 
-A `Measure` is a function of the `Equilibria` of a scene: its potential, and its states in the body and at
-the stop. Values are in internal units: mm, kPa, mN, uJ. Maxima are smooth (volume- or
-area-weighted power means, see `tensors.smooth_maximum`), so that they can be differentiated where
-the place of the true peak jumps; `Result` gives the true peaks beside them.
+Each is a function of the `Equilibria` of a scene: its potential, and its states in the body and at the stop.
+Values are in internal units: mm, kPa, mN, uJ. Maxima are smooth (volume- or area-weighted power means, see
+`tensors.smooth_maximum`), so that they can be differentiated where the place of the true peak jumps; `Result`
+gives the true peaks beside them.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +18,7 @@ from jax.nn import sigmoid
 from jaxclamp.core.tensors import smooth_maximum, total
 from jaxclamp.fem import landmarks
 from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.measure import Measure
 from jaxclamp.observe.stresses import facet_contact, touching
 from jaxclamp.potential.energy import group_energy
 from jaxclamp.potential.energy import stored_energy as _stored_energy
@@ -27,39 +26,6 @@ from jaxclamp.potential.terms import JAWS, Potential
 
 PEAK_SHARPNESS = 40.0
 """exponent of the power mean that stands for a maximum"""
-
-
-@dataclasses.dataclass(frozen=True)
-class Measure:
-    """A scalar function of the equilibria. Two measures of one name and arguments are equal."""
-
-    name: str
-    """such as smooth_peak_axial_stress"""
-    unit: str
-    """internal unit: mm, kPa, mN, uJ, or none"""
-    function: Callable[..., Array]
-    """of the equilibria and the arguments: a JAX scalar"""
-    arguments: tuple[str | float, ...] = ()
-    """such as a layer's name"""
-    needs_stop: bool = True
-    """False: the physiological state is all that it needs"""
-
-    def __call__(self, equilibria: Equilibria) -> Array:
-        """The value in internal units, a JAX scalar."""
-        return self.function(equilibria, *self.arguments)
-
-    def __str__(self) -> str:
-        inside = ", ".join(map(str, self.arguments))
-        return f"{self.name}({inside})"
-
-
-def require_measure(found: Any) -> Measure:
-    """The measure, or a TypeError that says what to write instead."""
-    if isinstance(found, Measure):
-        return found
-    name = getattr(found, "__name__", None)
-    said = f"the function {name}; call it, such as {name}()" if callable(found) and name else repr(found)
-    raise TypeError(f"expected a measure, found {said}")
 
 
 SMOOTHNESS_OF_THRESHOLD = 0.05

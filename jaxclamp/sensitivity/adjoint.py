@@ -24,7 +24,7 @@ from jax import Array
 from jaxclamp.core.records import record
 from jaxclamp.fem.landmarks import Landmarks
 from jaxclamp.observe.equilibria import Equilibria
-from jaxclamp.observe.measures import Measure, require_measure
+from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, positions, potential_of
 from jaxclamp.potential.tangent import Piece, cut, on_nodes, piece, piece_energy

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp.observe.measures import Measure
+from jaxclamp.observe.measure import Measure
 from jaxclamp.scenes import address
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.sensitivity.adjoint import value_and_clamp_gradient, value_and_gradient

@@ -31,7 +31,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from jaxclamp.core.records import record
 from jaxclamp.observe.equilibria import Equilibria
-from jaxclamp.observe.measures import Measure, require_measure
+from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.potential.densities import RIGID
 from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, discretise, positions, potential_of
