@@ -13,8 +13,10 @@ jax.config.update("jax_enable_x64", True)
 
 from jaxclamp.core.failures import EquilibriumError, Failure, SceneError, TooLittleMemory, Unfit, WorkerLost  # noqa: E402
 from jaxclamp.core.progress import Progress  # noqa: E402
+from jaxclamp.core.records import quantity, record, static  # noqa: E402
+from jaxclamp.observe.equilibria import Equilibria  # noqa: E402
 from jaxclamp.observe.figures import shown_in  # noqa: E402
-from jaxclamp.observe.measure import Measure  # noqa: E402
+from jaxclamp.observe.measure import Measure, N, kPa, mm, mm2, mN, uJ  # noqa: E402
 from jaxclamp.observe.measures import (  # noqa: E402
     MEASURES,
     axial_stress_at_P,
@@ -27,6 +29,7 @@ from jaxclamp.observe.measures import (  # noqa: E402
     lumen_height,
     lumen_width,
     mean_contact_pressure,
+    measure_of_files,
     physiological_lumen_radius,
     smooth_peak_axial_stress,
     smooth_peak_circumferential_stress,
@@ -35,10 +38,20 @@ from jaxclamp.observe.measures import (  # noqa: E402
     stored_energy,
     volume_above,
 )
+from jaxclamp.observe.points import (  # noqa: E402
+    cauchy_stress,
+    contact_pressures,
+    deformation_gradient,
+    smooth_maximum,
+    stresses,
+    volumes,
+)
 from jaxclamp.observe.stops import ForceStop, OcclusionStop, TravelStop  # noqa: E402
+from jaxclamp.physics.jaws import Jaw  # noqa: E402
+from jaxclamp.physics.materials import Material  # noqa: E402
 from jaxclamp.scenes.address import replace  # noqa: E402
 from jaxclamp.scenes.files import dump_scene, load_scene, require_possible  # noqa: E402
-from jaxclamp.scenes.scene import Scene  # noqa: E402
+from jaxclamp.scenes.scene import Scene, Stop  # noqa: E402
 from jaxclamp.sensitivity.adjoint import value_and_gradient  # noqa: E402
 from jaxclamp.sensitivity.gradients import gradients  # noqa: E402
 from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
@@ -49,49 +62,69 @@ from jaxclamp.trust.estimates import Estimate, Neighbours, neighbours, with_erro
 
 __all__ = [
     "MEASURES",
+    "Equilibria",
     "EquilibriumError",
     "Estimate",
     "Failure",
     "ForceStop",
+    "Jaw",
+    "Material",
     "Measure",
+    "N",
     "Neighbours",
     "OcclusionStop",
     "Progress",
     "Result",
     "Scene",
     "SceneError",
+    "Stop",
     "TooLittleMemory",
     "TravelStop",
     "Unfit",
     "WorkerLost",
     "axial_stress_at_P",
+    "cauchy_stress",
     "circumferential_stress_at_P",
     "clamp",
     "clamp_force",
+    "contact_pressures",
     "cores",
+    "deformation_gradient",
     "dump_scene",
     "evaluate",
     "gradients",
     "jaw_curvature",
     "jaw_half_width",
     "jaw_travel",
+    "kPa",
     "load_scene",
     "lumen_area",
     "lumen_height",
     "lumen_width",
+    "mN",
     "mean_contact_pressure",
+    "measure_of_files",
+    "mm",
+    "mm2",
     "neighbours",
     "physiological_lumen_radius",
+    "quantity",
+    "record",
     "replace",
     "require_possible",
     "shown_in",
+    "smooth_maximum",
     "smooth_peak_axial_stress",
     "smooth_peak_circumferential_stress",
     "smooth_peak_contact_pressure",
     "smooth_peak_principal_stress",
+    "static",
     "stored_energy",
+    "stresses",
+    "uJ",
     "value_and_gradient",
     "versions",
     "volume_above",
+    "volumes",
     "with_errors",
 ]

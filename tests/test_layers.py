@@ -33,6 +33,7 @@ CONFINED = {
     "matplotlib": {"pictures", "show"},
     "meshio": {"show"},
     "contourpy": {"pictures"},
+    "h5py": {"solve"},
     "typer": {"cli"},
     "rich": {"show"},
     "optimize": {"cli"},

@@ -1,9 +1,9 @@
-"""What is minimised, constrained or differentiated: one number of the equilibria of a scene.
+"""The measures that ship: what is minimised, constrained or differentiated.
 
-A `Measure` is a function of the `Equilibria` of a scene: its potential, and its states in the body and at
-the stop. Values are in internal units: mm, kPa, mN, uJ. Maxima are smooth (volume- or
-area-weighted power means, see `tensors.smooth_maximum`), so that they can be differentiated where
-the place of the true peak jumps; `Result` gives the true peaks beside them.
+Each is a function of the `Equilibria` of a scene: its potential, and its states in the body and at the stop.
+Values are in internal units: mm, kPa, mN, uJ. Maxima are smooth (volume- or area-weighted power means, see
+`tensors.smooth_maximum`), so that they can be differentiated where the place of the true peak jumps; `Result`
+gives the true peaks beside them.
 """
 
 from __future__ import annotations

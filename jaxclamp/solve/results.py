@@ -12,9 +12,7 @@ from jaxclamp.core.failures import EquilibriumError
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import FIGURES
 from jaxclamp.observe.measure import Measure, require_measure
-from jaxclamp.observe.measures import (
-    PEAK_SHARPNESS,
-)
+from jaxclamp.observe.measures import PEAK_SHARPNESS
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed

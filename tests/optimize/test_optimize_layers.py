@@ -172,7 +172,7 @@ def test_jaxopt_is_imported_by_one_module_of_optimize_and_none_of_jaxclamp():
 
 @pytest.mark.parametrize("package", ["jaxclamp", "optimize"])
 def test_what_draws_or_optimises_is_imported_when_it_is_needed(package):
-    heavy = ("matplotlib", "jaxopt", "nlopt", "optax", "pyvista", "meshio")
+    heavy = ("matplotlib", "jaxopt", "nlopt", "optax", "meshio", "h5py")
     asked = f"import sys, {package}; print(*sorted(set({heavy}) & set(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-c", asked], capture_output=True, text=True, cwd=ROOT, timeout=120, check=True
