@@ -120,7 +120,7 @@ def jaw_half_width() -> Measure:
     return Measure("jaw_half_width", "mm", _jaw_half_width)
 
 
-MEASURES: list[Callable[..., Measure]] = [
+MEASURES: tuple[Callable[..., Measure], ...] = (
     smooth_peak_axial_stress,
     smooth_peak_circumferential_stress,
     smooth_peak_principal_stress,
@@ -138,23 +138,8 @@ MEASURES: list[Callable[..., Measure]] = [
     physiological_lumen_radius,
     jaw_curvature,
     jaw_half_width,
-]
+)
 """every factory: study files can name those at the stop by the measure's name and unit"""
-
-Factory = Callable[..., Measure]
-
-
-def measure_of_files(factory: Factory) -> Factory:
-    """Let study files name a measure of one's own: a decorator of its factory.
-
-    The key is the measure's name and unit; arguments may be `layer` (the name of one) and `stress` (kPa).
-    Raises ValueError for a name that is taken.
-    """
-    taken = {known.__name__ for known in MEASURES if known.__module__ != factory.__module__}
-    if factory.__name__ in taken:
-        raise ValueError(f"there is a measure {factory.__name__} already: expected another name")
-    MEASURES[:] = [known for known in MEASURES if known.__name__ != factory.__name__] + [factory]
-    return factory
 
 
 # --- the functions ------------------------------------------------------------------------------
