@@ -110,6 +110,8 @@ def number(value: Any, key: str = "") -> str:
     """A value of result.json with the unit in its key, to four digits; a dash for none."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "–"
+    if isinstance(value, str):
+        return value
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):

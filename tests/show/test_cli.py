@@ -41,6 +41,7 @@ class FakeResult:
 
     converged: bool = True
     failure: Exception | None = None
+    solver: dict = dataclasses.field(default_factory=lambda: {"branch": "the closing path"})
 
     def to_dict(self):
         return FIGURES | {"converged": self.converged}
