@@ -55,8 +55,8 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
     require_computable(scene)
     if to_stop:
         require_a_gap(scene)
-    if guess is None or guess.scene.mesh != scene.mesh:
-        require_memory(unknowns_of(scene.mesh))
+    if (unknowns := unknowns_of(scene.mesh)) > (0 if guess is None else guess.model.pattern.n):
+        require_memory(unknowns)  # a guess of as many is proof that they fit
     model = build_model(scene, None if guess is None else guess.model)
     attempt, every_term = None, False
     if guess is not None:
