@@ -82,9 +82,10 @@ class Front:
         return f"no design met the constraints of {', '.join(bad)}" if bad else None
 
     def is_beaten(self, point: Point) -> bool:
-        """True if another point is better in one objective and no worse in the other."""
+        """True if another clamp (or start, reference) is better in one objective, no worse in the other."""
         a = np.array(point.values)
-        return any(np.all(p.values <= a) and np.any(p.values < a) for p in self.points)
+        others = [*(p.values for p in self.points), *self.others.values()]
+        return any(np.all(values <= a) and np.any(values < a) for values in map(np.array, others))
 
     def rows(self) -> list[dict[str, Any]]:
         """The rows of iterations.csv: one for each point, file units for the design."""

@@ -39,7 +39,8 @@ def plates_of(found: Front) -> list[Plate]:
     """The front, and the jaws on it."""
     front_said = (
         "Each point is the best design found in the first objective for its limit on the second. Hollow ones "
-        "are beaten by another in both. The start and the reference need not meet the study's constraints."
+        "are beaten by another clamp in both. The start and the reference need not meet the study's "
+        "constraints."
     )
     jaws_said = "Faces of the jaws along the artery, from the least first objective to the least second one."
     return [

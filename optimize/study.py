@@ -32,7 +32,7 @@ from optimize.journal import Journal
 from optimize.named_measures import in_words
 from optimize.price import Compared, injuries
 from optimize.problem import DesignProblem, require_consistent
-from optimize.record import Evaluation, Record
+from optimize.record import FEASIBLE, Evaluation, Record
 from optimize.resuming import take_over
 from optimize.starts import Budget, answer, drive, elsewhere
 from optimize.verification import Verification, verify
@@ -91,6 +91,8 @@ class Study:
         """The gain with the error of the difference, and its price."""
         found = {name: self.compared.gain(name) for name in ("reference", "start")}
         said = [f"best against {name}: {gain}" for name, gain in found.items() if gain is not None]
+        if (off := self.evaluations[0].violation(self.problem)) > FEASIBLE:
+            said.append(f"the start violates the constraints by {off:.1%}")
         return [*said, self.compared.sentence]
 
     def to_dict(self) -> dict[str, Any]:

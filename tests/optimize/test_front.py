@@ -79,6 +79,8 @@ def test_a_point_is_beaten_by_one_that_is_better_in_both(tmp_path):
     )
     found = Front(asked.problem, PRESSURE, points, {}, 0.0)
     assert [found.is_beaten(p) for p in points] == [False, False, True, False]
+    beside = Front(asked.problem, PRESSURE, points, {"reference": (3.5, 0.5)}, 0.0)
+    assert [beside.is_beaten(p) for p in points] == [False, False, True, True]
 
 
 @pytest.mark.slow

@@ -454,9 +454,27 @@ def test_the_command_line_does_a_study(tmp_path, capsys):
     fine = verified["start"]["objective"], verified["best"]["objective"]
     assert verified["gain_difference"] == pytest.approx(fine[0] - fine[1])
     assert verified["gain"] == pytest.approx(1.0 - fine[1] / fine[0])
+    for found in (study, verified):
+        gain = found["gains"]["start"]
+        fell = found["start"]["objective"] - found["best"]["objective"]
+        assert gain["difference"] == pytest.approx(fell)
+        assert gain["error"] >= 0.0
+        assert {row["measure"] for row in found["price"]} >= {"clamp force", "smooth peak contact pressure"}
+        assert all(row["reference"] is not None for row in found["price"])
+    assert verified["gain_error"] == verified["gains"]["start"]["error"]
+    text = (out / "report.html").read_text(encoding="utf-8")
+    assert "Smooth peak axial stress of the media, kPa: best" in text
+    assert "The price: everything else that injures" in text
     rows = (out / "iterations.csv").read_text().splitlines()
     assert len(rows) == study["evaluations"] + 1
-    for name in ("report.html", "figures/profiles.png", "figures/stress.png", "start/report.html"):
+    for name in (
+        "report.html",
+        "figures/profiles.png",
+        "figures/contact_pressure.png",
+        "figures/stress_difference.png",
+        "figures/stress.png",
+        "start/report.html",
+    ):
         assert (out / name).stat().st_size > 1000
     best = jc.load_scene(out / "best" / "scene.toml")
     assert jc.clamp(best).measure(PEAK) == pytest.approx(study["best"]["objective"], rel=1e-6)
