@@ -12,6 +12,7 @@ from jaxclamp.core.records import record
 from jaxclamp.core.tensors import total
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measures import jaw_forces
+from jaxclamp.observe.stresses import noise
 from jaxclamp.potential.densities import swept_volume
 from jaxclamp.potential.energy import energy, group_energy, group_points, lumen_volume
 from jaxclamp.potential.terms import BLOOD, INTIMA, JAWS, Potential
@@ -57,7 +58,8 @@ class Balance:
 def balance(e: Equilibria) -> Balance:
     """Vertical balance of the modelled part: supports, pressure and inner walls against the jaws.
 
-    Relative to the largest of them, or, where all vanish, to a thousandth of the wall's other forces.
+    Relative to the largest of them, or, where all vanish, to a thousandth of the wall's other forces, or to
+    what rounding leaves of none.
     """
     x, q, free = e.last.x, e.last.q, e.potential.layout.free
     pressure = e.potential.of(BLOOD)[0].here(BLOOD).pressure
@@ -76,8 +78,15 @@ def balance(e: Equilibria) -> Balance:
         residual=jnp.linalg.norm((elastic - pressure * swelling).ravel()[free]),
         jaw_force=e.marks.symmetry.parts_of_a_jaw * jnp.sum(jaws),
         inner_force=e.marks.symmetry.parts_of_a_jaw * jnp.sum(inner),
-        error=imbalance / (jnp.maximum(largest, 1e-3 * jnp.linalg.norm(elastic)) + 1e-6),
+        error=imbalance / (jnp.maximum(largest, 1e-3 * jnp.linalg.norm(elastic)) + _noise(e)),
     )
+
+
+def _noise(e: Equilibria) -> Array:
+    """Force that counts as none: the noise of the stiffest layer's stress over the outer wall, mN."""
+    area = total(jnp.sum(group.here(JAWS).dA) for group in e.potential.of(JAWS))
+    levels = [noise(layer.solid.material) for layer in e.potential.layers]
+    return area * jnp.max(jnp.stack(levels))
 
 
 def _lifting(e: Equilibria) -> Array:

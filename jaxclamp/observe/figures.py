@@ -27,7 +27,7 @@ from jaxclamp.observe.measures import (
     stress_at_P,
     travel_of_a_jaw,
 )
-from jaxclamp.observe.stresses import gaps
+from jaxclamp.observe.stresses import gaps, noise
 from jaxclamp.potential.energy import gather
 from jaxclamp.potential.terms import INTIMA, JAWS
 
@@ -84,14 +84,9 @@ def by_layer(read: Callable[[Equilibria, str], Any]) -> Read:
     return lambda e: {name: read(e, name) for name in e.marks.layer_names}
 
 
-NOISE, NOISE_OF_BULK = 1e-6, 1e-12
-"""a stress below this part of the shear modulus, or of the bulk modulus, is what tolerance and rounding
-leave of none"""
-
-
-def ratio(value: Array, base: Array, noise: Array) -> Array:
-    """value / base; not a number where the base is no more than noise."""
-    nothing = jnp.abs(base) <= noise
+def ratio(value: Array, base: Array, least: Array) -> Array:
+    """value / base; not a number where the base is no more than `least`."""
+    nothing = jnp.abs(base) <= least
     return jnp.where(nothing, jnp.nan, value / jnp.where(nothing, 1.0, base))
 
 
@@ -146,8 +141,7 @@ def _place_of_axial_peak(e: Equilibria, name: str) -> Array:
 def _stress_ratio(component: str) -> Read:
     def read(e: Equilibria) -> Array:
         material = e.potential.layers[e.marks.P_layer].solid.material
-        noise = NOISE * jnp.max(material.c) + NOISE_OF_BULK * jnp.max(material.bulk)
-        return ratio(stress_at_P(e, component), stress_at_P(e.in_body, component), noise)
+        return ratio(stress_at_P(e, component), stress_at_P(e.in_body, component), noise(material))
 
     return read
 

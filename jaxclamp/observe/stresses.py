@@ -15,10 +15,20 @@ from jax import Array
 
 from jaxclamp.core.records import record
 from jaxclamp.core.tensors import Tensor, cross, det, largest_eigenvalue, norm, product, total, transpose
+from jaxclamp.physics.materials import Material
 from jaxclamp.potential.densities import contact_pressure, deformation, jaw_gap
 from jaxclamp.potential.energy import State, at_points, gather, group_points
 from jaxclamp.potential.tangent import Piece, cut, piece
 from jaxclamp.potential.terms import JAWS, Group, Potential
+
+NOISE, NOISE_OF_BULK = 1e-6, 1e-12
+"""a stress below this part of the shear modulus, or of the bulk modulus, is what tolerance and rounding
+leave of none"""
+
+
+def noise(material: Material) -> Array:
+    """Stress of a layer that counts as none, kPa."""
+    return NOISE * jnp.max(material.c) + NOISE_OF_BULK * jnp.max(material.bulk)
 
 
 def cauchy_stress(cells: Piece) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxclamp.core.records import Range
 from jaxclamp.physics.contact import Contact
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.scene import Artery
@@ -25,13 +24,8 @@ def fitting_contact(artery: Artery) -> Contact:
     wall = sum(float(layer.thickness) for layer in artery.layers)
     c = max(float(np.max(np.asarray(layer.material.c))) for layer in artery.layers)
     stiffness = (c + float(artery.pressure)) / (PENETRATION * wall)
-    keys = {field.name: field.metadata["range"] for field in schema.fields_by_key(Contact).values()}
-    return Contact(
-        stiffness=_within(stiffness, keys["stiffness"]),
-        smoothing=_within(SMOOTHING * wall, keys["smoothing"]),
-    )
-
-
-def _within(value: float, interval: Range) -> float:
-    """The nearest number of a range."""
-    return min(max(value, interval.lower), interval.upper)
+    ranges = {key: field.metadata["range"] for key, field in schema.fields_by_key(Contact).items()}
+    values = zip(ranges.items(), (stiffness, SMOOTHING * wall), strict=True)
+    table = {key: min(max(value, span.lower), span.upper) for (key, span), value in values}
+    contact: Contact = schema.read(Contact, table, "contact")
+    return contact

@@ -16,7 +16,7 @@ from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
 from jaxclamp.scenes.scene import Scene
-from jaxclamp.solve.branch import work
+from jaxclamp.solve.branch import ROUNDING, work
 from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.newton import Equilibrium
 
@@ -230,9 +230,13 @@ def versions() -> dict[str, str]:
 
 
 def work_balance(closing: list[Kept]) -> float | None:
-    """Work of the jaws (`branch.work`) against the change of total energy over the closing, relative."""
+    """Work of the jaws (`branch.work`) against the change of total energy over the closing.
+
+    Relative to all work done, back and forth, and no less than what rounding leaves of the energy.
+    """
     if len(closing) < 3:
         return None
-    done = sum(work(a.equilibrium, b.equilibrium) for a, b in pairwise(closing))
-    change = float(closing[-1].equilibrium.lin.energy) - float(closing[0].equilibrium.lin.energy)
-    return abs(done - change) / max(abs(change), 1e-12)
+    steps = [work(a.equilibrium, b.equilibrium) for a, b in pairwise(closing)]
+    levels = [float(kept.equilibrium.lin.energy) for kept in closing]
+    least = ROUNDING * max(map(abs, levels)) + 1e-300
+    return abs(sum(steps) - (levels[-1] - levels[0])) / max(sum(map(abs, steps)), least)
