@@ -180,8 +180,8 @@ def run(
     if failure is not None:
         kept = f" (the states that converged are in {folder})" if files else ""
         return _fail(f"{failure}{kept}", failure.exit_code)
-    if result is not None and str(result.solver["branch"]).startswith("another"):
-        typer.echo(f"jaxclamp: warning: {result.solver['branch']}", err=True)
+    if (branch := console.branch_of(result.to_dict())).startswith("another"):
+        typer.echo(f"jaxclamp: warning: {branch}", err=True)
     return DONE
 
 

@@ -117,7 +117,7 @@ class MeshSettings:
 
 @record
 class SolverSettings:
-    """How equilibrium is found. The answer does not depend on it beyond the tolerance."""
+    """How equilibrium is found: on the path of closing jaws, whichever way (docs/which-equilibrium.md)."""
 
     tolerance: float = static(1e-9)
     """largest residual over the norm of the support reactions"""

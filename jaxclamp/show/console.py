@@ -120,10 +120,15 @@ def summary(result: dict[str, Any], files: list[Path]) -> list[str]:
                 named = f"{label}, {layer}" if layer else label
                 error = _error(result, block, f"{key}.{layer}" if layer else key)
                 output.append(f"    {named:<36}{figure(number):>10} {error}{unit}".rstrip())
-    branch = (result.get("solver") or {}).get("branch")
-    output += ["", f"  equilibrium: {branch}"] if branch else []
+    if branch := branch_of(result):
+        output += ["", f"  equilibrium: {branch}"]
     to_open = sorted((f for f in files if f.suffix in OPEN_FIRST), key=lambda f: OPEN_FIRST.index(f.suffix))
     return output + ["", *(f"  open {path}" for path in to_open)] if to_open else output
+
+
+def branch_of(result: dict[str, Any]) -> str:
+    """Which equilibrium a result is, in words; blank if nothing was clamped."""
+    return str((result.get("solver") or {}).get("branch") or "")
 
 
 def _error(result: dict[str, Any], block: str, key: str) -> str:

@@ -279,7 +279,7 @@ def checks(result: Result) -> list[tuple[str, str, str, bool]]:
         ),
     ]
     return [
-        (what, number(value, key), expected, bool(fine(value)))
+        (what, value if isinstance(value, str) else number(value, key), expected, bool(fine(value)))
         for what, key, value, expected, fine in rows
         if value is not None
     ]

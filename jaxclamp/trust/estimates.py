@@ -209,12 +209,15 @@ def with_errors(result: Result, near: Neighbours | None = None) -> Result:
     An answer that was followed from another result's is held against the closing path, on the coarser twin.
     """
     near = near or neighbours(result)
-    solver = result.solver | {"branch": _confirmed(result, near.twin)}
+    solver = result.solver | {"branch": _examined(result, near.twin)}
     return dataclasses.replace(result, errors=estimate(result, near), solver=solver)
 
 
-def _confirmed(result: Result, twin: Result | None) -> str | None:
-    """The result's branch; of a followed one, whether its twin is where the twin's own closing leads."""
+def _examined(result: Result, twin: Result | None) -> str | None:
+    """The result's branch; a followed one is another equilibrium if its twin is not where closing leads.
+
+    The same on both ways proves nothing: a coarser mesh has fewer equilibria to be told apart.
+    """
     branch: str | None = result.solver["branch"]
     if branch != FOLLOWED or twin is None or twin.solver["branch"] != FOLLOWED:
         return branch
@@ -224,7 +227,7 @@ def _confirmed(result: Result, twin: Result | None) -> str | None:
         return branch
     apart = float(np.max(np.abs(np.asarray(closed.states[-1].state.x - twin.states[-1].state.x))))
     if apart <= SAME * float(twin.final["lumen_width_mm"]):
-        return f"{FOLLOWED}; on a coarser mesh, closing anew leads to the same"
+        return branch
     forces = [f"{r.final['clamp_force_N']:.4g} N" for r in (closed, twin)]
     said = "on a coarser mesh, closing anew leads to a jaw force of {}, following this one to {}"
     return f"{ANOTHER}: {said.format(*forces)}"

@@ -53,6 +53,13 @@ def failed():
     )
 
 
+class Elsewhere(FakeResult):
+    """A result that is another equilibrium than the closing path's."""
+
+    def to_dict(self):
+        return super().to_dict() | {"solver": {"branch": "another equilibrium: unstable"}}
+
+
 class Engine:
     """Stands in for clamping and export: records what it was asked."""
 
@@ -134,6 +141,16 @@ def everything_below(folder):
 
 
 # ------------------------------------------------------------------------------------- run
+
+
+def test_run_warns_of_another_equilibrium(engine, capsys):
+    engine.outcome = Elsewhere()
+    code, out, err = call(capsys, "run", "human-lad", "--quiet", "--json")
+    assert code == 0
+    assert json.loads(out)["solver"]["branch"] == "another equilibrium: unstable"
+    assert "jaxclamp: warning: another equilibrium: unstable\n" in err
+    engine.outcome = FakeResult()
+    assert call(capsys, "run", "human-lad", "--quiet")[2] == ""
 
 
 def test_run_writes_beside_us_and_says_what_to_open(engine, capsys, tmp_path):

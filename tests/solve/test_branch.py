@@ -160,27 +160,22 @@ def test_the_same_on_the_mesh_of_the_study():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("start", "end"), [(1.3, 1.0), (1.0, 0.8)])
-def test_a_warm_start_that_leads_elsewhere_is_named(start, end):
-    """Followed, without a jump: 17.6 kPa instead of 26.2, and 27.0 instead of 31.8."""
-    warm = jc.clamp(sharp(half_width=end), guess=closed(half_width=start))
-    assert distance(warm, closed(half_width=end)) > 1e-2
+def test_a_warm_start_that_leads_elsewhere_is_named():
+    """Followed from a wider jaw, without a jump: 17.6 kPa instead of 26.2."""
+    warm = jc.clamp(sharp(), guess=closed(half_width=1.3))
+    assert distance(warm, closed()) > 1e-2
     assert warm.solver["branch"] == FOLLOWED
     known = jc.with_errors(warm)
     assert known.solver["branch"].startswith(f"{ANOTHER}: on a coarser mesh, closing anew leads to")
-    again = jc.clamp(sharp(half_width=1.01 * end), guess=known)
+    again = jc.clamp(sharp(half_width=1.01), guess=known)
     assert again.solver["branch"].startswith(f"{ANOTHER}: followed from a neighbour")
 
 
 @pytest.mark.slow
-def test_a_warm_start_that_leads_to_the_same_is_confirmed():
+def test_a_warm_start_that_leads_to_the_same_raises_no_alarm():
     warm = jc.clamp(sharp(), guess=closed(half_width=1.1))
     assert distance(warm, closed()) < 1e-6
-    assert warm.solver["branch"] == FOLLOWED
-    assert (
-        jc.with_errors(warm).solver["branch"]
-        == f"{FOLLOWED}; on a coarser mesh, closing anew leads to the same"
-    )
+    assert jc.with_errors(warm).solver["branch"] == FOLLOWED
 
 
 @pytest.mark.slow
