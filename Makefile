@@ -15,7 +15,7 @@ export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 
 help:
 	@echo "make test    lint, types and tests (creates $(VENV) on first use)"
-	@echo "make demo    find the jaw that injures a human coronary artery least, into $(OUT)/ (minutes)"
+	@echo "make demo    find the jaw that injures a human coronary artery least and presses no harder than a cylinder, into $(OUT)/ (minutes)"
 	@echo "make lint    lint, formatting and types only"
 	@echo "make slow    the tests that take more than a few seconds each"
 	@echo "make bench   timings"

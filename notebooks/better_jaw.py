@@ -14,8 +14,8 @@
 # # A better jaw
 #
 # One jaw, its gradient, and a jaw that injures less. To be quick the mesh here is coarse; the shipped
-# study, `jaxclamp optimise human-lad-jaw`, does the same on a mesh that resolves the jaw, and verifies
-# the result on a finer one.
+# study, `jaxclamp optimise human-lad-jaw-unbounded`, does the same on a mesh that resolves the jaw, and
+# verifies the result on a finer one.
 
 # %%
 import numpy as np

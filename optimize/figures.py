@@ -25,11 +25,9 @@ from jaxclamp.pictures.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
     FAINT,
-    INK,
-    NORMAL,
-    SMALL,
     THIRD,
     Picture,
+    colour_bar,
     dress,
     legend,
     nice_limits,
@@ -150,10 +148,7 @@ def plot_difference(study: Study) -> Picture:
             f"{name}: best less {study.compared.other}",
             grid=False,
         )
-    bar = figure.colorbar(drawn, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
-    bar.set_label("difference of axial Cauchy stress (kPa)", fontsize=NORMAL, color=INK)
-    bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
-    bar.outline.set_visible(False)
+    colour_bar(figure, drawn, "difference of axial Cauchy stress (kPa)")
     return figure
 
 
@@ -183,10 +178,7 @@ def plot_stress(study: Study) -> Picture:
                 f"{name}: {plain(layer.name)}",
                 grid=False,
             )
-    bar = figure.colorbar(scale, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
-    bar.set_label("axial Cauchy stress (kPa)", fontsize=NORMAL, color=INK)
-    bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
-    bar.outline.set_visible(False)
+    colour_bar(figure, scale, "axial Cauchy stress (kPa)")
     return figure
 
 

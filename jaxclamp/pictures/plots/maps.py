@@ -14,8 +14,8 @@ from jaxclamp.pictures.plots.states import Clamped, final_state
 from jaxclamp.pictures.plots.style import (
     INK,
     NORMAL,
-    SMALL,
     Picture,
+    colour_bar,
     dress,
     nice_limits,
     plain,
@@ -55,10 +55,7 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
             grid=False,
         )
         _view(view_axes, whole_grid(layer), zoom, scale, inside=number == 0, mark_P=P)
-    bar = figure.colorbar(scale, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
-    bar.set_label("axial Cauchy stress (kPa)", fontsize=NORMAL, color=INK)
-    bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
-    bar.outline.set_visible(False)
+    colour_bar(figure, scale, "axial Cauchy stress (kPa)")
     return figure
 
 

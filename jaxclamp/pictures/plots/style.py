@@ -73,6 +73,14 @@ def legend(axes: Axes, **options: Any) -> None:
     )
 
 
+def colour_bar(figure: Figure, colours: Any, label: str) -> None:
+    """One bar of colours (a ScalarMappable) for all maps of a figure."""
+    bar = figure.colorbar(colours, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
+    bar.set_label(label, fontsize=NORMAL, color=INK)
+    bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
+    bar.outline.set_visible(False)
+
+
 def layer_colour(number: int) -> tuple[str, str]:
     """Fill and edge of a layer, counted from 0 inside."""
     return LAYERS[number % len(LAYERS)], LAYER_EDGES[number % len(LAYER_EDGES)]
