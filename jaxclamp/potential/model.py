@@ -159,7 +159,7 @@ def build_model(scene: Scene, like: Model | None = None) -> Model:
 
 def bare(scene: Scene) -> Scene:
     """The scene without title and solver: programs that take it are not compiled anew for those."""
-    plain = dataclasses.replace(scene.solver, tolerance=0.0, continuation="", linear_solver="")
+    plain = dataclasses.replace(scene.solver, tolerance=0.0, continuation="", path_mesh="", linear_solver="")
     return dataclasses.replace(scene, title="", solver=plain)
 
 

@@ -114,6 +114,11 @@ class MeshSettings:
     symmetry: str = static("auto", choices=("auto", "xyz", "xy", "xz", "yz", "x", "y", "z", "none"))
     """mirror planes of the modelled part, by their normals; auto: all that hold"""
 
+    @property
+    def words(self) -> str:
+        """Elements around a quarter, along one half, and through each layer, such as 10 x 15 x (5 + 3)."""
+        return f"{self.circumferential} x {self.axial} x ({' + '.join(map(str, self.radial))})"
+
 
 @record
 class SolverSettings:
@@ -123,6 +128,9 @@ class SolverSettings:
     """largest residual over the norm of the support reactions"""
     continuation: str = static("lumen", choices=("lumen", "travel"))
     """close in steps of lumen height, or of jaw travel"""
+    path_mesh: str = static("coarser", choices=("coarser", "own"))
+    """walk the closing path on a coarser mesh, if that carries it, and solve for nothing but body and stop on
+    the scene's own; or walk all of it on the scene's own, which takes several times as long"""
     linear_solver: str = static("auto", choices=("auto", "pardiso", "rslab", "splu"))
     """sparse direct back end; auto takes the first that is installed"""
 

@@ -80,11 +80,12 @@ def artery_mesh(result: Result, kept: Kept, full: bool = True) -> Any:
     """A state of the wall as a meshio mesh: one block of hexahedra, points doubled at interfaces."""
     import meshio
 
-    assert result.load_free is not None
-    layers = layer_fields(result.model, kept.state, result.load_free.state)
+    load_free = result.load_free_like(kept)
+    assert load_free is not None
+    layers = layer_fields(kept.model, kept.state, load_free.state)
     if full:
         layers = tuple(whole(layer) for layer in layers)
-    element = result.model.mesh.element
+    element = kept.model.mesh.element
     starts = np.cumsum([0, *(len(layer.points) for layer in layers)])
     cells = [layer.cells + start for layer, start in zip(layers, starts, strict=False)]
     corners = np.concatenate(cells, axis=1)[list(element.meshio_nodes)].T
@@ -110,7 +111,7 @@ def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True)
 
     physiological = result.physiological
     open_height = None if physiological is None else physiological.values["outer_radius_mm"]
-    height = jaw_height_shown(result.model, kept.state, open_height)
+    height = jaw_height_shown(kept.model, kept.state, open_height)
     half_width = SIDE_MARGIN * _widest(result)
     z, y = outline[:-1].T
     n = len(z)
@@ -130,5 +131,5 @@ def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True)
 
 def _widest(result: Result) -> float:
     """Half the width of the artery where and when it is widest, mm."""
-    nodes = result.model.mesh.plane(0, -1)
-    return max(float(np.max(np.abs(np.asarray(kept.state.x)[nodes, 0]))) for kept in result.states)
+    xs = [np.asarray(kept.state.x)[kept.model.mesh.plane(0, -1), 0] for kept in result.states]
+    return max(float(np.max(np.abs(x))) for x in xs)

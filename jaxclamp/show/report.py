@@ -289,7 +289,7 @@ def _volume_ratios(result: Result) -> tuple[float | None, float | None]:
     """Smallest and largest mean volume ratio of a cell in the last state."""
     if not result.states:
         return None, None
-    J = [layer.cell_data["J"] for layer in layer_fields(result.model, result.states[-1].state)]
+    J = [layer.cell_data["J"] for layer in layer_fields(result.states[-1].model, result.states[-1].state)]
     return min(float(v.min()) for v in J), max(float(v.max()) for v in J)
 
 

@@ -15,9 +15,10 @@ from jaxclamp.core.progress import Progress, Tell, teller
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.files import require_computable
 from jaxclamp.scenes.scene import Scene
-from jaxclamp.solve.branch import branch_of
+from jaxclamp.solve.branch import CLOSING_PATH, branch_of
 from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.memory import require_memory, unknowns_of
+from jaxclamp.solve.nested import NEAR, to_walk_on
 from jaxclamp.solve.results import Result, work_balance
 from jaxclamp.solve.stages import Clamping
 from jaxclamp.solve.warm import branch_from, on_mesh_of, solve_warm
@@ -64,6 +65,10 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
         if result is not None:
             return result
         every_term = guess.every_term
+    elif to_stop and (coarser := to_walk_on(scene)) is not None:
+        result, attempt = _from_coarser_mesh(model, coarser, tell, start)
+        if result is not None:
+            return result
     attempt = Clamping(model, tell, every_term=every_term, before=attempt)
     try:
         return _from_nothing(attempt, to_stop, start)
@@ -116,6 +121,44 @@ def _from_neighbour(
     return None, clamping
 
 
+def _from_coarser_mesh(
+    model: Model, coarser: Scene, tell: Tell, start: float
+) -> tuple[Result | None, Clamping | None]:
+    """The result with its closing path walked on a coarser mesh; None where that leads to nothing sure.
+
+    It is sure if closing jaws lead to the coarser mesh's answer without a snap, and the finer mesh's one is
+    stable and near to it.
+    """
+    words, walked = coarser.mesh.words, "closing path"
+    tell_of_path = lambda event: (  # noqa: E731
+        tell(Progress(walked, event.fraction, f"{event.message}, on {words} elements"))
+        if event.stage == "clamping"
+        else tell(event)
+        if event.stage == walked
+        else None
+    )
+    try:
+        path = _solve(coarser, None, tell_of_path, to_stop=True)
+    except EquilibriumError:
+        return None, None
+    near = on_mesh_of(model, path) if path.solver["branch"] == CLOSING_PATH else None
+    if near is None:
+        return None, None
+    clamping = Clamping(model, tell, every_term=path.every_term)
+    try:
+        found = solve_warm(clamping, near, to_stop=True, carried_over=True)
+    except (EquilibriumError, TermMissing):
+        found = False
+    if not found:
+        return None, clamping
+    last, width = clamping.states[-1], clamping.states[-1].values["lumen_width_mm"]
+    apart = float(np.max(np.abs(np.asarray(last.state.x - near.states[-1].state.x))))
+    if last.equilibrium.negative_pivots or apart > NEAR * width:
+        return None, clamping
+    clamping.states[-1:] = [kept for kept in path.states[:-1] if kept.stage == "clamping"] + [last]
+    return _result(clamping, None, start, CLOSING_PATH, path), clamping
+
+
 def _from_nothing(clamping: Clamping, to_stop: bool, start: float) -> Result:
     """The result of the whole path."""
     try:
@@ -145,32 +188,47 @@ def peak_memory_MB() -> float | None:
 
 
 def _result(
-    clamping: Clamping, failure: EquilibriumError | None, start: float, branch: str | None = None
+    clamping: Clamping,
+    failure: EquilibriumError | None,
+    start: float,
+    branch: str | None = None,
+    coarser: Result | None = None,
 ) -> Result:
-    """What a clamping came to; branch: of an answer that was followed from a neighbour's."""
+    """What a clamping came to.
+
+    branch: of an answer that was followed from a neighbour's; coarser: with the closing path that led here
+    """
     system, states = clamping.system, tuple(clamping.states)
-    closing = [kept.equilibrium for kept in states if kept.stage == "clamping"]
-    branch = branch or (branch_of(closing) if closing else None)
+    closing = [kept for kept in states if kept.stage == "clamping"]
+    branch = branch or (branch_of([kept.equilibrium for kept in closing]) if closing else None)
     last = states[-1].values if states else {}
-    solver = {
-        "linear_solver": system.solver.name,
+    counts = {
         "load_steps": system.load_steps,
         "newton_iterations": system.newton_iterations,
         "factorisations": system.solver.factorisations,
+    }
+    seconds = {
+        "compile_s": system.compile_seconds,
+        "assembly_s": system.assembly_seconds - system.compile_seconds,
+        "factor_s": system.solver.factor_seconds,
+    }
+    balance = work_balance(closing) if coarser is None else coarser.solver["work_balance_error"]
+    if coarser is not None:
+        counts = {key: count + coarser.solver[key] for key, count in counts.items()}
+        seconds = {key: part + coarser.cost[key] for key, part in seconds.items()}
+    solver = {
+        "linear_solver": system.solver.name,
+        **counts,
         "residual_mN": last.get("residual_mN"),
         "force_balance_error": last.get("force_balance_error"),
-        "work_balance_error": work_balance([kept for kept in states if kept.stage == "clamping"]),
+        "work_balance_error": balance,
         "snapped": any(kept.equilibrium.snapped for kept in states),
         "negative_pivots": states[-1].equilibrium.negative_pivots if states else None,
         "branch": branch,
     }
-    cost = {
-        "wall_s": time.perf_counter() - start,
-        "compile_s": system.compile_seconds,
-        "assembly_s": system.assembly_seconds - system.compile_seconds,
-        "factor_s": system.solver.factor_seconds,
-        "peak_memory_MB": peak_memory_MB(),
-    }
+    cost = {"wall_s": time.perf_counter() - start, **seconds, "peak_memory_MB": peak_memory_MB()}
     settings = clamping.model.scene.solver
     factors = Factors(clamping.model.pattern, settings.linear_solver, system.solver)
-    return Result(clamping.model, states, failure, solver, cost, factors, clamping.every_term)
+    return Result(
+        clamping.model, states, failure, solver, cost, factors, clamping.every_term, coarser=coarser
+    )

@@ -39,6 +39,8 @@ class Kept:
     """the state and its tangent"""
     values: dict[str, Any]
     """as in result.json: floats, and one dict per layer for peaks"""
+    model: Model
+    """what it is an equilibrium of: states of the closing path may be of a coarser mesh than the last"""
 
     @property
     def state(self) -> State:
@@ -64,6 +66,8 @@ class Result:
     """of its tangents, for derivatives"""
     every_term: bool = False
     """solved with terms that its stop seemed not to need"""
+    coarser: Result | None = None
+    """the same on the coarser mesh on which its closing path was walked; None if that was its own"""
     errors: dict[str, dict[str, float | None]] | None = None
     """how far the main figures may be off, see `jaxclamp.trust.estimates`; None if it was not asked for"""
 
@@ -118,6 +122,12 @@ class Result:
         """The state without loads; None if it did not converge."""
         return next(iter(self._stage("load-free")), None)
 
+    def load_free_like(self, kept: Kept) -> Kept | None:
+        """The state without loads on the mesh of one of the states."""
+        if self.coarser is None or kept.model is self.model:
+            return self.load_free
+        return self.coarser.load_free_like(kept)
+
     @property
     def physiological(self) -> Kept | None:
         """The state in the body; None if it did not converge."""
@@ -149,6 +159,7 @@ class Result:
                 "negative_pivots": e.negative_pivots,
                 "snapped": e.snapped,
                 "newton_iterations": e.iterations,
+                "mesh": kept.model.scene.mesh.words,
             }
         )
 

@@ -101,7 +101,7 @@ class Clamping:
         )
         if closing:
             self.check(values)
-        self.states.append(Kept(stage, equilibrium, values))
+        self.states.append(Kept(stage, equilibrium, values, self.model))
         if stage == "physiological":
             self.refer_to(state, seen)
         self.tell(Progress(stage, fraction, message))
@@ -120,7 +120,7 @@ class Clamping:
 
     def take_over(self, *kept: Kept) -> None:
         """Go on from states that are known already, the last of them in the body."""
-        self.states[:] = kept
+        self.states[:] = [dataclasses.replace(each, model=self.model) for each in kept]
         self.refer_to(kept[-1].state)
 
     def use(self, model: Model) -> None:

@@ -37,8 +37,9 @@ def on_mesh_of(model: Model, guess: Result) -> Result | None:
     like = build_model(scene, model)
 
     def carried_over(kept: Kept) -> Kept:
-        state = transferred(kept.state, guess.model, like)
-        return dataclasses.replace(kept, equilibrium=dataclasses.replace(kept.equilibrium, state=state))
+        state = transferred(kept.state, kept.model, like)
+        moved = dataclasses.replace(kept.equilibrium, state=state)
+        return dataclasses.replace(kept, equilibrium=moved, model=like)
 
     # load-free, in the body, and the last one if that is another
     ends = [*guess.states[:2], *guess.states[2:][-1:]]

@@ -32,16 +32,15 @@ from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import FIGURES, POINT, WHOLE
 from jaxclamp.observe.measures import Measure
 from jaxclamp.scenes.address import get, replace
-from jaxclamp.scenes.scene import MeshSettings, Scene
+from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import ANOTHER, FOLLOWED
 from jaxclamp.solve.clamping import clamp, inflate
+from jaxclamp.solve.nested import coarser, on_coarser_mesh
 from jaxclamp.solve.results import Result
 from jaxclamp.solve.warm import predicted
 
 CHANGE = 1e-3
 """relative change of a penalty for its derivative"""
-COARSENINGS = (1.3, 2.0)
-"""elements of the scene over elements of its twin, per direction"""
 SAME = 1e-4
 """how far two states of one equilibrium are apart at most, as part of the lumen's width"""
 SOURCES = ("discretisation", "bulk", "contact_stiffness", "contact_smoothing")
@@ -89,21 +88,6 @@ def figures(result: Result) -> dict[str, float]:
             parts = value.items() if isinstance(value, dict) else [("", value)]
             found |= {f"{key}.{layer}" if layer else key: float(part) for layer, part in parts}
     return found
-
-
-def coarser(mesh: MeshSettings) -> tuple[MeshSettings, float]:
-    """A mesh coarsened as evenly in all directions as whole numbers allow, and by how much per direction."""
-    counts = np.array([mesh.circumferential, mesh.axial, *mesh.radial], float)
-    least = np.array([2, 2, *[1] * len(mesh.radial)])
-
-    def unevenness(factor: float) -> float:
-        return float(np.ptp(np.log(counts / np.maximum(np.round(counts / factor), least))))
-
-    factor = min(np.linspace(*COARSENINGS, 71), key=unevenness)
-    fewer = np.maximum(np.round(counts / factor), least).astype(int).tolist()
-    coarse = dataclasses.replace(mesh, circumferential=fewer[0], axial=fewer[1], radial=tuple(fewer[2:]))
-    cells = [m.circumferential * m.axial * sum(m.radial) for m in (mesh, coarse)]
-    return coarse, (cells[0] / cells[1]) ** (1.0 / 3.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,13 +224,13 @@ def bulk_paths(scene: Scene) -> tuple[str, ...]:
 
 def _twin(result: Result) -> tuple[Result | None, float]:
     """The scene on a coarser mesh, if it has an equilibrium there, and how much coarser per direction."""
-    mesh, ratio = coarser(result.scene.mesh)
-    if any(np.ndim(leaf) > 1 for leaf in jax.tree_util.tree_leaves(result.scene.artery)):
-        return None, ratio  # constants of each point belong to one mesh
-    scene = dataclasses.replace(result.scene, mesh=mesh)
+    ratio = coarser(result.scene.mesh)[1]
+    if result.coarser is not None:  # on which its closing path was walked
+        return result.coarser, ratio
+    scene = on_coarser_mesh(result.scene)
     solve: Callable[..., Result] = clamp if result.states[-1].stage == "clamping" else inflate
     try:
-        return solve(scene, guess=result), ratio
+        return None if scene is None else solve(scene, guess=result), ratio
     except EquilibriumError:
         return None, ratio
 

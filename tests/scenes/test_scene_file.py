@@ -80,7 +80,12 @@ def scene_table(jaw, stop, first=HGO, second=HGO):
             "contact_points": 4,
             "symmetry": "xz",
         },
-        "solver": {"tolerance": 1e-9, "continuation": "travel", "linear_solver": "splu"},
+        "solver": {
+            "tolerance": 1e-9,
+            "continuation": "travel",
+            "path_mesh": "own",
+            "linear_solver": "splu",
+        },
     }
 
 

@@ -237,8 +237,8 @@ def test_quadratic_elements_are_written_and_mirrored_too(tmp_path):
     model = build_model(scene)
     far = jnp.asarray([100.0])
     x = closed_positions(model.mesh, scene.mesh, scene.artery)
-    kept = types.SimpleNamespace(state=with_equilibrium_pressure(model.potential, x, far))
-    fake = types.SimpleNamespace(model=model, scene=scene, load_free=kept)
+    kept = types.SimpleNamespace(state=with_equilibrium_pressure(model.potential, x, far), model=model)
+    fake = types.SimpleNamespace(model=model, scene=scene, load_free_like=lambda kept: kept)
     meshio.write(tmp_path / "a.vtu", paraview.artery_mesh(fake, kept))
     (block,) = meshio.read(tmp_path / "a.vtu").cells
     assert block.type == "hexahedron27"
@@ -284,6 +284,7 @@ def pressed(symmetry: str, element: str = "q1p0"):
         types.SimpleNamespace(
             state=with_equilibrium_pressure(model.potential, positions, jnp.asarray([1.1])),
             values={"outer_radius_mm": 2.4},
+            model=model,
         )
         for positions in (jnp.stack([x, y, z], axis=1), flat)
     )
@@ -291,6 +292,7 @@ def pressed(symmetry: str, element: str = "q1p0"):
         model=model,
         scene=scene,
         load_free=load_free,
+        load_free_like=lambda kept: load_free,
         physiological=load_free,
         states=(load_free, last),
         closing=(load_free, last),
@@ -441,7 +443,9 @@ def test_long_names_of_layers_leave_a_figure_its_room(result, name):
     scene = result.scene
     for i in range(2):
         scene = jc.replace(scene, f"artery.layers[{i}].name", str(i) * 200)
-    renamed = dataclasses.replace(result, model=dataclasses.replace(result.model, scene=scene))
+    model = dataclasses.replace(result.model, scene=scene)
+    states = tuple(dataclasses.replace(kept, model=model) for kept in result.states)
+    renamed = dataclasses.replace(result, model=model, states=states)
     images = [_pixels(getattr(r, f"plot_{name}")()) for r in (result, renamed)]
     assert images[0].shape == images[1].shape
     inked = [np.ptp(np.nonzero((image[..., :3] < 128).any(axis=-1))[1]) for image in images]

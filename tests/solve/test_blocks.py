@@ -32,7 +32,7 @@ def on(X: np.ndarray, *planes: tuple[int, float]) -> np.ndarray:
     return held
 
 
-@pytest.mark.parametrize("element", ["q1p0", "q2p1"])
+@pytest.mark.parametrize("element", ["q1p0", pytest.param("q2p1", marks=pytest.mark.slow)])
 def test_a_strip_between_smooth_grips(element):
     """Uniaxial stretch: sigma = c (l**2 - 1/l) for an incompressible neo-Hookean solid."""
     stretch, width, thickness = 1.5, 2.0, 0.5

@@ -113,7 +113,7 @@ def test_what_an_answer_is(path, said):
 def test_work_that_comes_to_nothing_is_balanced_by_what_was_done():
     """There and back, with rounding: nothing is left to compare the energies' difference with."""
     path = with_energies(spring(0.9, 0.7, 0.9), 0.0, 0.0, 1e-10)
-    kept = [Kept("clamping", one, {}) for one in path]
+    kept = [Kept("clamping", one, {}, None) for one in path]
     assert work_balance(kept) < 1e-9
 
 

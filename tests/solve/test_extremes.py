@@ -175,7 +175,7 @@ def errors_of_differences(result: jc.Result) -> dict[str, float]:
 @pytest.mark.parametrize(
     "name",
     [
-        "nearly incompressible",
+        pytest.param("nearly incompressible", marks=pytest.mark.slow),
         pytest.param("hard, sharp contact", marks=pytest.mark.slow),
         "no blood, no stretch",
     ],

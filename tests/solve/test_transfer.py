@@ -100,6 +100,7 @@ def test_leads_to_the_solution_that_a_cold_start_finds(coarse, mesh):
     assert warm.final["force_balance_error"] < 1e-8
 
 
+@pytest.mark.slow
 def test_with_harder_contact_on_the_way(coarse):
     """Another mesh and other floats at once."""
     scene = jc.replace(on_mesh(coarse.scene, axial=14), "contact.stiffness", 6000.0)
@@ -118,7 +119,8 @@ def test_between_elements():
     np.testing.assert_allclose(again.states[-1].state.x, linear.states[-1].state.x, rtol=0.0, atol=1e-7)
 
 
-@pytest.mark.parametrize("stop", [pytest.param("travel_mm=1.9", marks=pytest.mark.slow), "force_N=0.2"])
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", ["travel_mm=1.9", "force_N=0.2"])
 def test_at_other_stops(coarse, stop):
     def scene(axial):
         counts = ("mesh.circumferential=6", f"mesh.axial={axial}", "mesh.radial=[2, 2]")

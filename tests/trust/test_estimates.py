@@ -11,7 +11,8 @@ import jaxclamp as jc
 from jaxclamp.show.console import summary
 from jaxclamp.show.report import page
 from jaxclamp.solve.clamping import inflate
-from jaxclamp.trust.estimates import SOURCES, coarser, estimate, figures, multiplied, with_errors
+from jaxclamp.solve.nested import coarser
+from jaxclamp.trust.estimates import SOURCES, estimate, figures, multiplied, with_errors
 from jaxclamp.trust.price_list import REFERENCE_MESHES, richardson, scaled
 from tube import SEED, SEED_PRESSURE, SEED_STRETCH, Incompressible, random_sectors
 from walks import mesh, tube_scene
@@ -113,7 +114,7 @@ def test_without_a_twin_the_error_is_not_known(clamped, monkeypatch):
         raise jc.EquilibriumError("clamping", "somewhere", Failure("no"), "nothing")
 
     monkeypatch.setattr("jaxclamp.trust.estimates.clamp", refuse)
-    found = estimate(clamped)["clamp_force_N"]
+    found = estimate(dataclasses.replace(clamped, coarser=None))["clamp_force_N"]
     assert found["discretisation"] is None
     assert found["error"] is None
     assert found["bulk"] == pytest.approx(clamped.errors["clamp_force_N"]["bulk"])

@@ -112,6 +112,7 @@ def test_a_variant_is_solved_with_its_price():
     assert price.figures[GRADIENT] == pytest.approx((ends[0] - ends[1]) / 0.002, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_single_precision_is_judged_at_the_solution():
     scene = jc.load_scene("human-lad", [*TINY, "stop.occlusion=0.5"])
     price = accuracy.solve(accuracy.Rung("precision", "float32", scene, single_precision=True))
@@ -127,6 +128,7 @@ def test_what_is_refused_has_no_figures():
     assert math.isnan(price.seconds)
 
 
+@pytest.mark.slow
 def test_no_reference_is_exit_code_3(tmp_path, capsys, monkeypatch):
     """A finer mesh without a solution leaves nothing to compare with."""
     refused = lambda rungs, tell: [Price(r.group, r.setting, None, "no equilibrium") for r in rungs]

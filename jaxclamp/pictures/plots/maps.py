@@ -34,7 +34,7 @@ EQUALLY_HIGH = 1e-6
 def plot_axial_stress_maps(result: Clamped) -> Picture:
     """Axial Cauchy stress of every layer in the last state, on one colour scale."""
     kept = final_state(result)
-    layers = layer_fields(result.model, kept.state)
+    layers = layer_fields(kept.model, kept.state)
     zoom = half_length_shown(result, layers)
     limits = nice_limits(
         [layer.point_data[FIELD][np.abs(layer.points[:, 2]) <= zoom] for layer in layers], 5.0

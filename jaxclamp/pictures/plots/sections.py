@@ -20,7 +20,6 @@ WIDTH = 10.5
 def plot_sections(result: Clamped) -> Picture:
     """Cross-section at mid-length and longitudinal section, whole artery with jaws, states A to F."""
     states = shown_states(result)
-    model = result.model
     wide, high = _largest(result)
     jaw_half = float(result.scene.clamp.jaw.half_extent())
     across, along = 1.12 * wide, max(1.15 * jaw_half + high, 1.8 * high)
@@ -38,7 +37,7 @@ def plot_sections(result: Clamped) -> Picture:
     for place, (letter, index) in enumerate(states.items()):
         kept, record = result.closing[index], result.history[index]
         row, column = divmod(place, COLUMNS)
-        height = jaw_height_shown(model, kept.state, open_height)
+        height = jaw_height_shown(kept.model, kept.state, open_height)
         left = figure.add_subplot(grid[row, 3 * column])
         right = figure.add_subplot(grid[row, 3 * column + 1])
         for side in (1, -1):
@@ -52,7 +51,7 @@ def plot_sections(result: Clamped) -> Picture:
                 )
             )
         for number in range(len(result.scene.artery.layers)):
-            layer = whole_positions(model, kept.state, number)
+            layer = whole_positions(kept.model, kept.state, number)
             _cross_section(left, layer, number)
             _longitudinal_section(right, layer, number)
         _frame(left, across, up)
@@ -67,9 +66,9 @@ def plot_sections(result: Clamped) -> Picture:
 def _largest(result: Clamped) -> tuple[float, float]:
     """Largest half width and half height of the artery at mid-length over the closing, mm."""
     outermost = len(result.scene.artery.layers) - 1
-    grids = [whole_positions(result.model, kept.state, outermost) for kept in result.closing]
-    ring = np.abs([grid.points[grid.middle, :, -1] for grid in grids])
-    return float(np.max(ring[..., 0])), float(np.max(ring[..., 1]))
+    grids = [whole_positions(kept.model, kept.state, outermost) for kept in result.closing]
+    rings = np.abs(np.concatenate([grid.points[grid.middle, :, -1] for grid in grids]))
+    return float(np.max(rings[:, 0])), float(np.max(rings[:, 1]))
 
 
 def _bar(axes: Axes, face: float, back: float, across: float) -> None:

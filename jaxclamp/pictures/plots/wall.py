@@ -41,7 +41,7 @@ def plot_wall_stress(result: Clamped) -> Picture:
     figure = Picture(4.6 * len(panels), 3.6)
     for place, (title, kept) in enumerate(panels):
         axes = figure.add_subplot(1, len(panels), place + 1)
-        layers = layer_fields(result.model, kept.state)
+        layers = layer_fields(kept.model, kept.state)
         _through_wall(axes, {layer.name: whole_grid(layer) for layer in layers})
         dress(axes, "radius (mm)", "Cauchy stress (kPa)" if place == 0 else "", title)
     legend(figure.axes[0], loc="best")
