@@ -312,7 +312,7 @@ def _values(view: Callable[[Equilibria], Any], e: Equilibria) -> Record:
     return {figure.key: figure.read(seen) for figure in FIGURES if figure.view is view}
 
 
-_read = partial(jax.jit, static_argnums=0)(_values)
+_read = partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})(_values)
 
 
 def read_figures(equilibria: Equilibria) -> Record:

@@ -62,7 +62,9 @@ def test_counts_are_of_both_meshes():
 
 def test_gradients_are_those_of_its_own_mesh():
     peak = jc.smooth_peak_axial_stress("media")
-    found = [float(jc.value_and_gradient(solved(way), peak)[1].clamp.jaw.radius) for way in ("coarser", "own")]
+    found = [
+        float(jc.value_and_gradient(solved(way), peak)[1].clamp.jaw.radius) for way in ("coarser", "own")
+    ]
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
