@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -14,8 +13,9 @@ from jaxclamp.core.records import record, static
 PAIRS = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
 """component pairs (i, j) of a symmetric 3 x 3 block, in the order in which matrices keep them"""
 
-POINTS_PER_BLOCK = 2400
-"""quadrature points differentiated together: their intermediate arrays then fit a core's cache"""
+POINTS_PER_BLOCK = 768
+"""quadrature points differentiated together, in the wall of whatever mesh: one compiled program serves all,
+and intermediate arrays fit a core's cache"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Pattern:
     indices: np.ndarray
     """column of each entry, (n_nonzeros,)"""
     places: dict[str, sp.csr_matrix] = dataclasses.field(default_factory=dict)
-    """by region: the entries of its matrices [a, b, pair, cell], block by block, summed into the tangent's
-    values; (n_nonzeros, number of entries), ones"""
+    """by region: the entries of its matrices [a, b, pair, cell] summed into the tangent's values;
+    (n_nonzeros, number of entries), ones"""
 
     @property
     def n(self) -> int:
@@ -47,8 +47,8 @@ class Region:
 
     nodes: np.ndarray
     """of each cell or facet, (n_en, n_cells)"""
-    blocks: tuple[tuple[int, int], ...] = static()
-    """first and last-plus-one cell of what is differentiated together; all of one size"""
+    size: int = static()
+    """of a block: cells or facets differentiated together"""
 
 
 @record
@@ -61,14 +61,9 @@ class Layout:
     """nodes of all bodies"""
 
 
-def cut_into_blocks(counts: tuple[int, ...], points_per_cell: int) -> int:
-    """Cells per block: a common divisor of the layers' counts.
-
-    One size means one compiled program; a block within a layer has one material.
-    """
-    common = math.gcd(*counts)
-    wanted = max(POINTS_PER_BLOCK // points_per_cell, 1)
-    return max(d for d in range(1, min(wanted, common) + 1) if common % d == 0)
+def block_size(points_per_cell: int) -> int:
+    """Cells of a block of the wall: the same on every mesh of one element."""
+    return max(POINTS_PER_BLOCK // points_per_cell, 1)
 
 
 def build_pattern(
@@ -83,14 +78,7 @@ def build_pattern(
     unknown = np.full(held.size, -1)
     unknown[free] = np.arange(len(free))
     n = len(free)
-    blocks = {
-        name: tuple((first, first + size) for first in range(0, nodes.shape[1], size))
-        for name, (nodes, size) in regions.items()
-    }
-    entries = {
-        name: np.concatenate([_keys(nodes[:, slice(*block)], unknown, n) for block in blocks[name]])
-        for name, (nodes, _) in regions.items()
-    }
+    entries = {name: _keys(nodes, unknown, n) for name, (nodes, _) in regions.items()}
     distinct, place = np.unique(np.concatenate(list(entries.values())), return_inverse=True)
     skipped = int(distinct[0] == -1)
     ends = np.cumsum([keys.size for keys in entries.values()])[:-1]
@@ -100,10 +88,7 @@ def build_pattern(
     }
     rows, indices = np.divmod(distinct[skipped:], n)
     indptr = np.searchsorted(rows, np.arange(n + 1))
-    found = {
-        name: Region(nodes=nodes.astype(np.int32), blocks=blocks[name])
-        for name, (nodes, _) in regions.items()
-    }
+    found = {name: Region(nodes=nodes.astype(np.int32), size=size) for name, (nodes, size) in regions.items()}
     layout = Layout(free=free.astype(np.int32), n_nodes=len(held))
     return layout, found, Pattern(indptr.astype(np.int32), indices.astype(np.int32), places)
 

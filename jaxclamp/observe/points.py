@@ -14,7 +14,7 @@ from jaxclamp.core.tensors import smooth_maximum as power_mean
 from jaxclamp.observe import stresses as wall
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measures import PEAK_SHARPNESS, contact_points
-from jaxclamp.potential.tangent import piece
+from jaxclamp.potential.tangent import whole
 
 
 def stresses(equilibria: Equilibria, layer: str) -> wall.Stresses:
@@ -24,7 +24,7 @@ def stresses(equilibria: Equilibria, layer: str) -> wall.Stresses:
 
 def _at_points(equilibria: Equilibria, layer: str) -> tuple[Tensor, Tensor]:
     group = equilibria.potential.layers[equilibria.marks.layer(layer)]
-    return wall.cauchy_stress(piece(group, equilibria.last, 0, group.nodes.shape[1]))
+    return wall.cauchy_stress(whole(group, equilibria.last))
 
 
 def deformation_gradient(equilibria: Equilibria, layer: str) -> Array:

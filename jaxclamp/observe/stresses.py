@@ -14,12 +14,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxclamp.core.records import record
-from jaxclamp.core.tensors import Tensor, cross, det, largest_eigenvalue, norm, product, total, transpose
+from jaxclamp.core.tensors import Tensor, components, cross, det, largest_eigenvalue, norm, total
 from jaxclamp.physics.materials import Material
-from jaxclamp.potential.densities import contact_pressure, deformation, jaw_gap
-from jaxclamp.potential.energy import State, at_points, gather, group_points
-from jaxclamp.potential.tangent import Piece, cut, piece
+from jaxclamp.potential.densities import contact_pressure, jaw_gap
+from jaxclamp.potential.energy import State, at_points, gather, group_points, stacked_at_points
+from jaxclamp.potential.tangent import Piece, cut, joined, whole
 from jaxclamp.potential.terms import JAWS, Group, Potential
+from jaxclamp.potential.wall import kirchhoff_stress
 
 NOISE, NOISE_OF_BULK = 1e-6, 1e-12
 """a stress below this part of the shear modulus, or of the bulk modulus, is what tolerance and rounding
@@ -39,12 +40,10 @@ def cauchy_stress(cells: Piece) -> tuple[Tensor, Tensor]:
     """
     solid = cells.heres[0]
     assert cells.pressures is not None
-    F = deformation(at_points(cells.stencil, cells.x), solid)
-    P = jax.grad(lambda G: jnp.sum(solid.material.psi_bar(G)))(F)
+    F, J, tau = kirchhoff_stress(stacked_at_points(cells.stencil, cells.x), solid)
     p = jnp.einsum("mq,mc->qc", cells.pressures.modes, cells.pressures.p)
-    J = det(F)
-    tau = product(P, transpose(F))
-    return F, {(i, j): tau[i, j] / J + p if i == j else tau[i, j] / J for i, j in tau}
+    sigma = tau / J + jnp.eye(3)[:, :, None, None] * p
+    return components(F), components(sigma)
 
 
 def along(F: Tensor, sigma: Tensor, axis: int) -> Array:
@@ -87,9 +86,8 @@ _piece_stresses = jax.jit(piece_stresses)
 
 def stresses(potential: Potential, state: State) -> tuple[Stresses, ...]:
     """Stress components of interest at every quadrature point, by layer."""
-    joined = lambda *arrays: jnp.concatenate(arrays, axis=-1)  # noqa: E731
     return tuple(
-        jax.tree_util.tree_map(joined, *[_piece_stresses(cells) for cells in cut(group, state)])
+        joined(group, jax.device_get([_piece_stresses(cells) for cells in cut(group, state)]))
         for group in potential.layers
     )
 
@@ -97,7 +95,7 @@ def stresses(potential: Potential, state: State) -> tuple[Stresses, ...]:
 def layer_stresses(potential: Potential, state: State, layer: int) -> Stresses:
     """The same for one layer, in one program that can be differentiated."""
     group = potential.layers[layer]
-    return piece_stresses(piece(group, state, 0, group.nodes.shape[1]))
+    return piece_stresses(whole(group, state))
 
 
 def gaps(group: Group, state: State) -> Array:

@@ -39,9 +39,14 @@ def at_points(stencil: AnyArray, x: Array) -> dict[tuple[int, int], Array]:
 
     stencil: (n_q, n_c, n_en); x: positions of the cells' nodes, (n_en, 3, n_cells)
     """
+    return components(stacked_at_points(stencil, x))
+
+
+def stacked_at_points(stencil: AnyArray, x: Array) -> Array:
+    """The same as one array, (n_c, 3, n_q, n_cells)."""
     n_q, n_c, n_en = stencil.shape
     y = jnp.matmul(jnp.reshape(stencil, (n_q * n_c, n_en)), x.reshape(n_en, -1))
-    return components(jnp.moveaxis(y.reshape(n_q, n_c, 3, -1), 0, 2))
+    return jnp.moveaxis(y.reshape(n_q, n_c, 3, -1), 0, 2)
 
 
 def gather(x: Array, nodes: AnyArray) -> Array:

@@ -13,7 +13,7 @@ from jaxclamp.core.programs import forget_if_crowded
 from jaxclamp.core.records import record, shape_of
 from jaxclamp.fem.grid import Mesh
 from jaxclamp.fem.landmarks import Landmarks, find_landmarks
-from jaxclamp.fem.pattern import Layout, Pattern, Region, build_pattern, cut_into_blocks
+from jaxclamp.fem.pattern import Layout, Pattern, Region, block_size, build_pattern
 from jaxclamp.fem.stencils import Stencils, build_stencils
 from jaxclamp.fem.symmetry import Symmetry, symmetry_of
 from jaxclamp.fem.tube import build_tube, end_height, end_lines, supports
@@ -93,8 +93,7 @@ def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
     mesh = build_tube(scene.mesh)
     stencils = build_stencils(mesh.element, scene.mesh.contact_points)
     sides = _sides(mesh, scene.mesh)
-    counts = tuple(last - first for first, last in mesh.layer_cells)
-    size = cut_into_blocks(counts, len(stencils.weights))
+    size = block_size(len(stencils.weights))
     nodes = {f"layer {i}": (mesh.cells[:, slice(*span)], size) for i, span in enumerate(mesh.layer_cells)}
     nodes["lumen"] = (mesh.inner_facets, mesh.inner_facets.shape[1])
     for name, facets in sides.items():

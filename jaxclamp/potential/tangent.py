@@ -10,7 +10,7 @@ zz, xy, xz, yz) over all pairs of nodes. One program serves every piece of one k
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from jaxclamp.core.records import record, static
-from jaxclamp.core.tensors import Tensor, det, pointwise_derivatives, stacked, total
+from jaxclamp.core.tensors import Tensor, components, det, pointwise_derivatives, stacked, total
 from jaxclamp.fem.pattern import PAIRS, Layout, Pattern
 from jaxclamp.potential.densities import RIGID, Density, Solid, dilatation
 from jaxclamp.potential.energy import (
@@ -30,9 +30,12 @@ from jaxclamp.potential.energy import (
     dilatations,
     gather,
     group_points,
+    stacked_at_points,
 )
 from jaxclamp.potential.terms import Group, Potential
-from jaxclamp.potential.wall import by_pairs, wall_derivatives
+from jaxclamp.potential.wall import by_pairs, wall_derivatives, wall_energy
+
+Tree = TypeVar("Tree")
 
 
 def to_nodes(stencil: AnyArray, dy: Array) -> Array:
@@ -67,7 +70,7 @@ class Pressures:
 
 @record
 class Piece:
-    """The cells of one block of a group, cut out of potential and state; it knows no names."""
+    """Cells of one group, cut out of potential and state; it knows no names."""
 
     stencil: Array
     """(n_q, n_c, n_en)"""
@@ -87,10 +90,10 @@ class Piece:
 
 @record
 class Linearised:
-    """A piece, linearised. What it does not have is None."""
+    """A piece, linearised, cell by cell. What it does not have is None."""
 
     energy: Array
-    """with the pressures at their best, uJ"""
+    """with the pressures at their best, uJ, (n_cells,)"""
     force: Array
     """d Pi/dx of the cells' nodes at the stored pressures, mN, (n_en, 3, n_cells)"""
     matrix: Array
@@ -98,15 +101,15 @@ class Linearised:
     missing_force: Array | None = None
     """what condensing the pressures adds to the force, mN, (n_en, 3, n_cells)"""
     volume_error: Array | None = None
-    """largest |mean J - 1 - p / bulk| of a cell"""
+    """|mean J - 1 - p / bulk|, (n_cells,)"""
     J_range: Array | None = None
-    """smallest and largest volume ratio, (2,)"""
+    """smallest and largest volume ratio, (2, n_cells)"""
     rigid_slope: Array | None = None
-    """d Pi/dq, mN, (n_q,)"""
+    """d Pi/dq, mN, (n_q, n_cells)"""
     coupling: Array | None = None
     """d2 Pi/dx dq, mN/mm, (n_q, n_en, 3, n_cells)"""
     rigid_stiffness: Array | None = None
-    """d2 Pi/dq2, mN/mm, (n_q, n_q)"""
+    """d2 Pi/dq2, mN/mm, (n_q, n_q, n_cells)"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,49 +153,66 @@ class Linearisation:
 # --- pieces -----------------------------------------------------------------------------------------
 
 
-def cut(group: Group, state: State) -> list[Piece]:
-    """A group at a state cut into its blocks, on the host.
-
-    Slices inside the program that differentiates would keep it from being vectorised.
-    """
-    group, state = jax.tree_util.tree_map(np.asarray, (group, state))
-    return [piece(group, state, *block) for block in group.blocks]
-
-
-def piece(group: Group, state: State, first: int, last: int) -> Piece:
-    """The cells of a group from `first` to before `last`."""
-    whole = (first, last) == (0, group.nodes.shape[1])
-    cells = lambda a: a if whole or jnp.ndim(a) < 2 else a[..., first:last]  # noqa: E731
-    part = lambda tree: jax.tree_util.tree_map(cells, tree)  # noqa: E731
+def whole(group: Group, state: State) -> Piece:
+    """All cells of a group at a state."""
     pressures = None
     if group.volume is not None:
         assert group.modes is not None
-        start = group.volume.cells[0]
-        pressures = Pressures(
-            p=state.p[:, start + first : start + last],
-            modes=group.modes,
-            stiffness=part(group.volume.stiffness),
-        )
+        p = state.p[:, slice(*group.volume.cells)]
+        pressures = Pressures(p=p, modes=group.modes, stiffness=group.volume.stiffness)
     return Piece(
         stencil=group.stencil,
-        x=gather(state.x, group.nodes[:, first:last]),
+        x=gather(state.x, group.nodes),
         q=state.q,
         densities=tuple(term.density for term in group.terms),
-        heres=tuple(part(term.here) for term in group.terms),
+        heres=tuple(term.here for term in group.terms),
         moved=group.moved,
         pressures=pressures,
     )
 
 
+def cut(group: Group, state: State) -> list[Piece]:
+    """A group at a state cut into its blocks, all of one size, on the host.
+
+    The last one is filled up with its last cell, again and again: see `joined`. Slices inside the program
+    that differentiates would keep it from being vectorised.
+    """
+    group, state = jax.tree_util.tree_map(np.asarray, (group, state))
+    cells, n = whole(group, state), group.nodes.shape[1]
+    if n == group.size:
+        return [cells]
+
+    def block(first: int) -> Piece:
+        missing = max(first + group.size - n, 0)
+
+        def of(a: Any) -> Any:
+            found = a[..., first : first + group.size]
+            return np.concatenate([found, *[found[..., -1:]] * missing], axis=-1) if missing else found
+
+        heres = jax.tree_util.tree_map(lambda a: of(a) if np.ndim(a) > 1 else a, cells.heres)
+        pressures = cells.pressures
+        if pressures is not None:
+            pressures = dataclasses.replace(pressures, p=of(pressures.p), stiffness=of(pressures.stiffness))
+        return dataclasses.replace(cells, x=of(cells.x), heres=heres, pressures=pressures)
+
+    return [block(first) for first in range(0, n, group.size)]
+
+
+def joined(group: Group, blocks: list[Tree]) -> Tree:
+    """What blocks of a group have found, cells last, as that of the group, on the host."""
+    n = group.nodes.shape[1]
+    return jax.tree_util.tree_map(lambda *parts: np.concatenate(parts, axis=-1)[..., :n], *blocks)
+
+
 def piece_energy(piece: Piece, x: Array, heres: tuple[Any, ...], stiffness: Array) -> Array:
     """Energy of a piece of the wall, the pressures at their best, uJ, with other positions and data."""
     assert piece.pressures is not None
-    y, solid = at_points(piece.stencil, x), heres[0]
-    D = dilatations(piece.pressures.modes, solid, y)
-    points = total(
-        jnp.sum(density(y, piece.q, here)) for density, here in zip(piece.densities, heres, strict=True)
-    )
-    return points + 0.5 * jnp.sum(D * condensed_pressures(stiffness, D))
+    Y, (solid, *others) = stacked_at_points(piece.stencil, x), heres
+    shape, dilated = wall_energy(Y, solid)
+    D = jnp.einsum("mq,qc->mc", piece.pressures.modes, dilated)
+    further = zip(piece.densities[1:], others, strict=True)
+    points = [shape, *(density(components(Y), piece.q, here) for density, here in further)]
+    return total(map(jnp.sum, points)) + 0.5 * jnp.sum(D * condensed_pressures(stiffness, D))
 
 
 @jax.jit
@@ -221,15 +241,15 @@ def linearise_piece(piece: Piece) -> Linearised:
         parts.append((value, slope[:n_y].reshape(n_c, 3, *shape), square))
     values, first, moduli = (total(each) for each in zip(*parts, strict=True))
     found: dict[str, Any] = {
-        "energy": jnp.sum(values),
+        "energy": jnp.sum(values, axis=0),
         "force": to_nodes(piece.stencil, first),
         "matrix": to_matrices(piece.stencil, moduli),
     }
     if piece.moved:
         mixed = second[n_y:, :n_y].reshape(len(moving), n_c, 3, *shape)
-        found["rigid_slope"] = jnp.sum(slope[n_y:], axis=(1, 2))
+        found["rigid_slope"] = jnp.sum(slope[n_y:], axis=1)
         found["coupling"] = jnp.stack([to_nodes(piece.stencil, part) for part in mixed])
-        found["rigid_stiffness"] = jnp.sum(second[n_y:, n_y:], axis=(2, 3))
+        found["rigid_stiffness"] = jnp.sum(second[n_y:, n_y:], axis=2)
     if piece.pressures is not None:
         found |= _condensed(piece.pressures, piece.heres[0], piece.stencil, y, found)
     return Linearised(**found)
@@ -258,11 +278,11 @@ def _condensed(
     compliance = 1.0 / (stiffness[0, 0] * jnp.sum(solid.dV, axis=0))
     return {
         # potential with p eliminated: replace int p (J - 1) by 1/2 D' M^-1 D
-        "energy": found["energy"] + 0.5 * jnp.sum(D * (missing + p)) - jnp.sum(p * D),
+        "energy": found["energy"] + jnp.sum(D * (0.5 * (missing + p) - p), axis=0),
         "matrix": found["matrix"] + added,
         "missing_force": total(mode * missing[m] for m, mode in enumerate(by_mode)),
-        "volume_error": jnp.max(jnp.abs(jnp.einsum("mq,mc->qc", modes, missing)) * compliance),
-        "J_range": jnp.stack([jnp.min(J), jnp.max(J)]),
+        "volume_error": jnp.max(jnp.abs(jnp.einsum("mq,mc->qc", modes, missing)), axis=0) * compliance,
+        "J_range": jnp.stack([jnp.min(J, axis=0), jnp.max(J, axis=0)]),
     }
 
 
@@ -283,33 +303,31 @@ def assemble(potential: Potential, pattern: Pattern, pieces: list[list[Linearise
     values = np.zeros(len(pattern.indices))
     wall, missing, loads = np.zeros((3, layout.n_nodes, 3))
     slope, stiffness, coupling = np.zeros(n_q), np.zeros((n_q, n_q)), np.zeros((n_q, layout.n_nodes, 3))
-    for group, blocks in zip(potential.groups, pieces, strict=True):
+    found: list[Any] = [joined(*each) for each in zip(potential.groups, pieces, strict=True)]
+    for group, cells in zip(potential.groups, found, strict=True):
         nodes = np.asarray(group.nodes)
-        joined = lambda of: np.concatenate([of(block) for block in blocks], axis=-1)  # noqa: B023, E731
-        values += pattern.places[group.region] @ np.concatenate([block.matrix.ravel() for block in blocks])
-        _add(loads if group.volume is None else wall, nodes, joined(lambda block: block.force))
+        values += pattern.places[group.region] @ cells.matrix.ravel()
+        _add(loads if group.volume is None else wall, nodes, cells.force)
         if group.volume is not None:
-            _add(missing, nodes, joined(lambda block: block.missing_force))
+            _add(missing, nodes, cells.missing_force)
         if group.moved:
-            for block in blocks:
-                slope += np.asarray(block.rigid_slope)
-                stiffness += np.asarray(block.rigid_stiffness)
-            for field, cells in zip(coupling, joined(lambda block: block.coupling), strict=True):
-                _add(field, nodes, cells)
+            slope += np.sum(cells.rigid_slope, axis=-1)
+            stiffness += np.sum(cells.rigid_stiffness, axis=-1)
+            for field, of_cells in zip(coupling, cells.coupling, strict=True):
+                _add(field, nodes, of_cells)
     imbalance = np.linalg.norm((wall + loads).ravel()[free])
     residual = (wall + missing + loads).ravel()
     held = np.delete(residual, free)
-    every = [block for blocks in pieces for block in blocks]
-    of_wall = [block for block in every if block.J_range is not None]
-    J = np.array([block.J_range for block in of_wall])
+    of_wall = [cells for cells in found if cells.J_range is not None]
+    J = np.concatenate([cells.J_range for cells in of_wall], axis=-1)
     return Linearisation(
-        energy=sum(float(block.energy) for block in every),
-        wall_energy=sum(float(block.energy) for block in of_wall),
+        energy=sum(float(np.sum(cells.energy)) for cells in found),
+        wall_energy=sum(float(np.sum(cells.energy)) for cells in of_wall),
         wall_force=wall + missing,
         residual=residual[free],
         imbalance=float(imbalance),
         reactions=float(np.linalg.norm(held)),
-        volume_error=float(np.max(np.array([block.volume_error for block in of_wall]))),
+        volume_error=float(np.max(np.concatenate([cells.volume_error for cells in of_wall]))),
         values=values,
         rigid_force=-slope,
         coupling=coupling.reshape(n_q, -1)[:, free].T,

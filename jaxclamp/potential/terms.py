@@ -55,8 +55,8 @@ class Term:
     density: Density = static()
     """uJ at the points, see `densities`"""
     here: Any
-    """what the density knows of its points; in a group of several blocks, arrays of two or more axes have
-    the cells last"""
+    """what the density knows of its points; where regions are cut into blocks, arrays of two or more axes
+    have the cells last"""
     moved: bool = static(default=False)
     """the density depends on the rigid coordinates"""
 
@@ -88,8 +88,8 @@ class Group:
     """where they live"""
     nodes: np.ndarray
     """(n_en, n_cells)"""
-    blocks: tuple[tuple[int, int], ...] = static()
-    """first and last-plus-one cell of each piece"""
+    size: int = static()
+    """cells of a block"""
     stencil: Array
     """(n_q, n_c, n_en)"""
     terms: tuple[Term, ...]
@@ -365,7 +365,7 @@ def build_potential(
         return Group(
             region=place[0],
             nodes=region.nodes,
-            blocks=region.blocks,
+            size=region.size,
             stencil=jnp.asarray(at[place[1]]),
             terms=tuple(t for t in members if isinstance(t, Term)),
             volume=volume,

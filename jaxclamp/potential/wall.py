@@ -22,13 +22,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jaxclamp.core.tensors import Tensor, cross, det, pointwise_derivatives, stacked, total
+from jaxclamp.core.tensors import Tensor, components, cross, det, pointwise_derivatives, stacked, total
 from jaxclamp.fem.pattern import PAIRS
 from jaxclamp.physics.materials import FibreLaw
-from jaxclamp.potential.densities import Solid, mixed_energy
+from jaxclamp.potential.densities import Solid, deformation, dilatation, mixed_energy, shape_energy
 
 
 def wall_derivatives(
@@ -50,6 +51,52 @@ def wall_derivatives(
     return energy, first.reshape(3, 3, *shape), by_pairs(second.reshape(3, 3, 3, 3, *shape))
 
 
+def wall_energy(Y: Array, solid: Solid) -> tuple[Array, Array]:
+    """psi_bar dV and (J - 1) dV, each (n_q, n_cells), of tangents Y[c, i] (3, 3, n_q, n_cells).
+
+    The same as `densities.shape_energy` and `dilatation`, in few operations on stacked arrays: a program that
+    differentiates it again and again stays small.
+    """
+    law, L = solid.material, solid.to_local
+    if not isinstance(law, FibreLaw):
+        y = components(Y)
+        return shape_energy(y, (), solid), dilatation(y, solid)
+    J = _volume_ratio(Y, L)
+    F, _, fibres = _kinematics(Y, L, law)
+    psi = law.psi_of_invariants(jnp.sum(F * F, axis=(0, 1)), J, [jnp.sum(v * v, axis=0) for v in fibres])
+    return psi * solid.dV, (J - 1.0) * solid.dV
+
+
+def kirchhoff_stress(Y: Array, solid: Solid) -> tuple[Array, Array, Array]:
+    """F and d psi_bar/dF F' in kPa, each (3, 3, n_q, n_cells), and J, of tangents Y[c, i].
+
+    Of a law of invariants, 2 w_1 F F' + J w_J I + 2 sum w_4 (F a) (x) (F a).
+    """
+    law, L = solid.material, solid.to_local
+    if not isinstance(law, FibreLaw):
+        F = stacked(deformation(components(Y), solid))
+        P = jax.grad(lambda F: jnp.sum(law.psi_bar(components(F))))(F)
+        return F, det(F), total(P[:, k][:, None] * F[:, k][None] for k in range(3))
+    F, _, fibres = _kinematics(Y, L, law)
+    invariants = [jnp.sum(F * F, axis=(0, 1)), _volume_ratio(Y, L), *(jnp.sum(v * v, axis=0) for v in fibres)]
+    w = jax.grad(lambda v: jnp.sum(law.psi_of_invariants(v[0], v[1], v[2:])))(invariants)
+    F, fibres, w, J = lax.optimization_barrier((F, fibres, w, invariants[1]))
+    left = total(F[:, k][:, None] * F[:, k][None] for k in range(3))
+    parts = [w[0] * left, *(w4 * v[:, None] * v[None] for w4, v in zip(w[2:], fibres, strict=True))]
+    return F, J, 2.0 * total(parts) + jnp.eye(3)[:, :, None, None] * (J * w[1])
+
+
+def _volume_ratio(Y: Array, L: Array) -> Array:
+    return jnp.sum(Y[0] * jnp.cross(Y[1], Y[2], axis=0), axis=0) * det(L)
+
+
+def _kinematics(Y: Array, L: Array, law: FibreLaw) -> tuple[Array, list[Array], list[Array]]:
+    """F (3, 3, n_q, n_cells); of each fibre family m = L a and F a, each (3, n_q, n_cells)."""
+    F = total(Y[c][:, None] * L[c][None] for c in range(3))
+    axes = [total(a[k] * L[:, k] for k in range(3)) for a in law.directions()]
+    return F, axes, [total(m[c] * Y[c] for c in range(3)) for m in axes]
+
+
 def by_pairs(second: Array) -> Array:
     """Second derivatives (n_c, 3, n_c, 3, n_q, n_cells) by the six PAIRS, (n_c, n_c, n_q, 6, n_cells)."""
     return jnp.stack([second[:, i, :, j] for i, j in PAIRS], axis=3)
@@ -57,9 +104,7 @@ def by_pairs(second: Array) -> Array:
 
 def _by_invariants(y: Tensor, p: Array, solid: Solid, law: FibreLaw) -> tuple[Array, Array, Array]:
     Y, L = stacked(y), solid.to_local
-    F = total(Y[c][:, None] * L[c][None] for c in range(3))
-    axes = [total(a[k] * L[:, k] for k in range(3)) for a in law.directions()]
-    fibres = [total(m[c] * Y[c] for c in range(3)) for m in axes]
+    F, axes, fibres = _kinematics(Y, L, law)
     cofactor = jnp.stack([jnp.stack(cross(Y[c - 2], Y[c - 1])) for c in range(3)])
     scale = det(L)
     J = scale * jnp.sum(Y[0] * cofactor[0], axis=0)

@@ -27,8 +27,8 @@ from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, positions, potential_of
-from jaxclamp.potential.tangent import Piece, cut, on_nodes, piece, piece_energy
-from jaxclamp.potential.terms import Potential
+from jaxclamp.potential.tangent import Piece, cut, on_nodes, piece_energy, whole
+from jaxclamp.potential.terms import Group, Potential
 from jaxclamp.scenes.scene import Scene, Stop
 from jaxclamp.sensitivity.implicit import Unknowns, contact_forces, solution, solve_linear
 from jaxclamp.solve.results import Result
@@ -105,7 +105,7 @@ def _measured(measure: Measure, potential: Potential, marks: Landmarks, at: Size
 
 
 Wall = tuple[Array, tuple[Any, ...], Array]
-"""what a piece of the wall knows of a scene: positions of its nodes, its points, M^-1"""
+"""what a layer of the wall, or a piece of it, knows of a scene: positions of its nodes, its points, M^-1"""
 
 
 def _of_piece(cells: Piece) -> Wall:
@@ -114,23 +114,27 @@ def _of_piece(cells: Piece) -> Wall:
 
 
 def _wall_work(potential: Potential, state: State, y: Array) -> list[Wall]:
-    """Derivatives of the wall's forces at a state times y, (n_nodes, 3), by piece."""
-    moves = dataclasses.replace(state, x=y)
-    return [
-        _piece_work(cells, move.x)
-        for group in potential.layers
-        for cells, move in zip(cut(group, state), cut(group, moves), strict=True)
-    ]
+    """Derivatives of the wall's forces at a state times y, (n_nodes, 3), by layer."""
+    return [_layer_work(group, state, dataclasses.replace(state, x=y)) for group in potential.layers]
+
+
+def _layer_work(group: Group, state: State, moves: State) -> Wall:
+    """The same for a layer: what belongs to its cells side by side, what they share summed."""
+    n, size, parts = group.nodes.shape[1], group.size, []
+    for i, (cells, move) in enumerate(zip(cut(group, state), cut(group, moves), strict=True)):
+        there = np.arange(i * size, (i + 1) * size) < n  # and not there to fill up a block
+        parts.append(_piece_work(cells, move.x * there))
+    together = lambda *a: np.concatenate(a, axis=-1)[..., :n] if np.ndim(a[0]) > 1 else sum(a)  # noqa: E731
+    return jax.tree_util.tree_map(together, *jax.device_get(parts))
 
 
 @jax.jit
 def _piece_work(cells: Piece, y: Array) -> Wall:
     """Derivatives of a piece's forces times y; one program for all pieces of one size and law."""
 
-    def work(*known: Any) -> Array:
-        return jax.jvp(lambda x: piece_energy(cells, x, *known[1:]), (known[0],), (y,))[1]
-
-    found: Wall = jax.grad(work, argnums=(0, 1, 2))(*_of_piece(cells))
+    slopes = jax.grad(lambda *known: piece_energy(cells, *known), argnums=(0, 1, 2))
+    x, *others = _of_piece(cells)
+    found: Wall = jax.jvp(lambda x: slopes(x, *others), (x,), (y,))[1]
     return found
 
 
@@ -170,14 +174,13 @@ def _by_scene(
         p = jnp.zeros((len(d.stencils.modes), d.mesh.n_cells))
         state = State(x=x, p=p, q=q)
         known = Sizes(data=potential.data, stop=scene.stop, x_body=x, x_stop=x, q=q)
-        pieces = [piece(g, state, *block) for g in potential.layers for block in g.blocks]
-        return known, [_of_piece(cells) for cells in pieces]
+        return known, [_of_piece(whole(group, state)) for group in potential.layers]
 
     of_sizes = jax.tree_util.tree_map(jnp.subtract, measured, surfaces)
-    of_pieces = [
+    of_layers = [
         jax.tree_util.tree_map(lambda *each: -sum(each), *parts) for parts in zip(*walls, strict=True)
     ]
-    gradient: Scene = jax.vjp(sizes, scene)[1]((of_sizes, of_pieces))[0]
+    gradient: Scene = jax.vjp(sizes, scene)[1]((of_sizes, of_layers))[0]
     return gradient
 
 

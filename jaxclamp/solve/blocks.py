@@ -20,7 +20,7 @@ import numpy as np
 from jaxclamp.core.failures import NotConverged
 from jaxclamp.core.programs import forget_if_crowded
 from jaxclamp.fem.grid import Mesh, build_block
-from jaxclamp.fem.pattern import Layout, Pattern, build_pattern, cut_into_blocks
+from jaxclamp.fem.pattern import Layout, Pattern, block_size, build_pattern
 from jaxclamp.fem.stencils import build_stencils
 from jaxclamp.observe.stresses import cauchy_stress
 from jaxclamp.physics.contact import Contact
@@ -29,7 +29,7 @@ from jaxclamp.physics.materials import Material
 from jaxclamp.potential.bodies import Body, brick_body, facet_areas
 from jaxclamp.potential.densities import RIGID, Touch, jaw_energy
 from jaxclamp.potential.energy import State, energy, with_equilibrium_pressure
-from jaxclamp.potential.tangent import piece
+from jaxclamp.potential.tangent import whole
 from jaxclamp.potential.terms import JAWS, Potential, Term, build_potential, wall_terms
 from jaxclamp.solve.descent import descend
 from jaxclamp.solve.linear_solvers import LinearSolver
@@ -89,7 +89,7 @@ def brick(
     stencils = build_stencils(mesh.element, contact_points)
     X = positions(unit_places(mesh)) if callable(positions) else np.asarray(positions, float)
     fixed = np.asarray(held(X) if callable(held) else held, bool)
-    size = cut_into_blocks(tuple(b - a for a, b in mesh.layer_cells), len(stencils.weights))
+    size = block_size(len(stencils.weights))
     nodes = {f"layer {i}": (mesh.cells[:, slice(*span)], size) for i, span in enumerate(mesh.layer_cells)}
     nodes["upper outside"] = (mesh.outer_facets, mesh.outer_facets.shape[1])
     layout, regions, pattern = build_pattern(fixed, nodes)
@@ -174,5 +174,5 @@ _gradient = jax.jit(lambda potential, state: jax.grad(energy, argnums=1)(potenti
 def stress(block: Block, state: State, layer: int = 0) -> np.ndarray:
     """Cauchy stress at the points of a layer, kPa, (3, 3, n_q, n_cells)."""
     group = block.potential.layers[layer]
-    _, sigma = cauchy_stress(piece(group, state, 0, group.nodes.shape[1]))
+    _, sigma = cauchy_stress(whole(group, state))
     return np.stack([np.stack([np.asarray(sigma[i, j]) for j in range(3)]) for i in range(3)])

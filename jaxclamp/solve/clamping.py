@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 
 import jax
 import jax.numpy as jnp
@@ -137,14 +139,19 @@ def _from_coarser_mesh(
         if event.stage == walked
         else None
     )
-    try:
-        path = _solve(coarser, None, tell_of_path, to_stop=True)
-    except EquilibriumError:
-        return None, None
-    near = on_mesh_of(model, path) if path.solver["branch"] == CLOSING_PATH else None
-    if near is None:
-        return None, None
-    clamping = Clamping(model, tell, every_term=path.every_term)
+    clamping = Clamping(model, lambda event: None)
+    with _beside(clamping) as in_body:
+        try:
+            path = _solve(coarser, None, tell_of_path, to_stop=True)
+        except EquilibriumError:
+            clamping.system.patience = 0  # nobody waits for the state in the body any more
+            return None, None
+        near = on_mesh_of(model, path) if path.solver["branch"] == CLOSING_PATH else None
+        if near is None:
+            return None, None
+        if in_body.exception() is not None:
+            clamping = Clamping(model, tell)
+    clamping.tell, clamping.every_term = tell, path.every_term
     try:
         found = solve_warm(clamping, near, to_stop=True, carried_over=True)
     except (EquilibriumError, TermMissing):
@@ -157,6 +164,24 @@ def _from_coarser_mesh(
         return None, clamping
     clamping.states[-1:] = [kept for kept in path.states[:-1] if kept.stage == "clamping"] + [last]
     return _result(clamping, None, start, CLOSING_PATH, path), clamping
+
+
+@contextmanager
+def _beside(clamping: Clamping) -> Iterator[Future[None]]:
+    """In another thread meanwhile, the state in the body is found, and what closing needs is compiled."""
+
+    def work() -> None:
+        in_body = clamping.in_body(clamping.load_free())
+        clamping.use_terms(closing=True)
+        clamping.system.linearise(in_body.state, in_body.pressure)
+
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(work)
+        try:
+            yield future
+        except BaseException:
+            clamping.system.patience = 0
+            raise
 
 
 def _from_nothing(clamping: Clamping, to_stop: bool, start: float) -> Result:
