@@ -25,6 +25,7 @@ from jaxclamp.scenes.files import dump_scene
 from jaxclamp.show.console import as_json
 from jaxclamp.show.paraview import FOLDER as STATES
 from jaxclamp.show.paraview import write_states
+from jaxclamp.solve.results import flat
 
 if TYPE_CHECKING:
     from jaxclamp.pictures.plots import Plate
@@ -135,7 +136,7 @@ def plain(content: Any) -> Any:
 
 def history_csv(history: list[dict[str, Any]]) -> str:
     """One row per state; columns of layers are called KEY.LAYER, of places KEY.LAYER.x and so on."""
-    rows = [dict(_flat(plain(record))) for record in history]
+    rows = [dict(flat(plain(record))) for record in history]
     columns = list(dict.fromkeys(name for row in rows for name in row))
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, ["state", *columns], restval="", lineterminator="\n")
@@ -143,16 +144,6 @@ def history_csv(history: list[dict[str, Any]]) -> str:
     for number, row in enumerate(rows):
         writer.writerow({"state": number, **{name: _cell(value) for name, value in row.items()}})
     return buffer.getvalue()
-
-
-def _flat(record: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in record.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        elif isinstance(value, list):
-            yield from ((f"{prefix}{key}.{axis}", v) for axis, v in zip("xyz", value, strict=False))
-        else:
-            yield prefix + key, value
 
 
 def _cell(value: Any) -> Any:
