@@ -17,7 +17,14 @@ from jaxclamp.core.records import record
 from jaxclamp.core.tensors import Tensor, cross, det, largest_eigenvalue, norm, product, total, transpose
 from jaxclamp.physics.materials import Material
 from jaxclamp.potential.densities import contact_pressure, deformation, jaw_gap
-from jaxclamp.potential.energy import State, at_points, gather, group_points
+from jaxclamp.potential.energy import (
+    State,
+    at_points,
+    condensed_pressures,
+    dilatations,
+    gather,
+    group_points,
+)
 from jaxclamp.potential.tangent import Piece, cut, piece
 from jaxclamp.potential.terms import JAWS, Group, Potential
 
@@ -45,6 +52,17 @@ def cauchy_stress(cells: Piece) -> tuple[Tensor, Tensor]:
     J = det(F)
     tau = product(P, transpose(F))
     return F, {(i, j): tau[i, j] / J + p if i == j else tau[i, j] / J for i, j in tau}
+
+
+def strain_energy(cells: Piece) -> Array:
+    """Strain energy of each cell over its stress-free volume, kPa, (n_cells,), pressures at their best."""
+    solid, known = cells.heres[0], cells.pressures
+    assert known is not None
+    y = at_points(cells.stencil, cells.x)
+    D = dilatations(known.modes, solid, y)
+    shape = jnp.sum(solid.material.psi_bar(deformation(y, solid)) * solid.dV, axis=0)
+    volume = 0.5 * jnp.sum(D * condensed_pressures(known.stiffness, D), axis=0)
+    return (shape + volume) / jnp.sum(solid.dV, axis=0)
 
 
 def along(F: Tensor, sigma: Tensor, axis: int) -> Array:
