@@ -17,6 +17,7 @@ import numpy as np
 from jaxclamp.pictures.fields import jaw_height_shown, jaw_outline, layer_fields, whole
 from jaxclamp.pictures.tensors import with_fibres, with_tensors
 from jaxclamp.potential.model import Model
+from jaxclamp.show.jaw import write_jaw
 
 if TYPE_CHECKING:
     from jaxclamp.solve.results import Kept, Result
@@ -34,12 +35,13 @@ SIDE_MARGIN = 1.15
 def write_states(
     result: Result, folder: Path, tell: Callable[[float, str], None] = lambda fraction, message: None
 ) -> list[Path]:
-    """Write all states into `folder`; returns the files, the index last."""
+    """Write all states, and the jaw's face, into `folder`; returns the files."""
     import meshio
 
     (folder / FOLDER).mkdir(exist_ok=True)
     full = is_whole(result.model)
-    outline = jaw_outline(result.scene.clamp.jaw, 2.0 * _widest(result))
+    jaw, widest = result.scene.clamp.jaw, _widest(result)
+    outline = jaw_outline(jaw, 2.0 * widest)
     index: list[tuple[float, str, str]] = []
     for number, (kept, time) in enumerate(zip(result.states, times(result), strict=True)):
         tell(number / len(result.states), f"state {number + 1} of {len(result.states)}")
@@ -51,7 +53,8 @@ def write_states(
             meshio.write(folder / name, made, compression="zlib")
             index.append((time, part, name))
     (folder / INDEX).write_text(pvd(index), encoding="utf-8")
-    return [*(folder / name for _, _, name in index), folder / INDEX]
+    of_jaw = write_jaw(jaw, 2.0 * widest, SIDE_MARGIN * widest, folder)
+    return [*(folder / name for _, _, name in index), folder / INDEX, *of_jaw]
 
 
 def is_whole(model: Model) -> bool:

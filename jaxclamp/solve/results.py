@@ -21,6 +21,7 @@ from jaxclamp.observe.measures import PEAK_SHARPNESS
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
+from jaxclamp.scenes.files import scene_table
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import ROUNDING, work
 from jaxclamp.solve.linear_solvers import Factors
@@ -220,6 +221,7 @@ class Result:
             "title": scene.title,
             "converged": self.converged,
             "failure": None if self.failure is None else str(self.failure),
+            "scene": scene_table(scene),
             "load_free": {
                 "lumen_radius_mm": _radius(load_free),
                 "outer_radius_mm": load_free and load_free.values["outer_radius_mm"],

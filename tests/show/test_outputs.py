@@ -82,8 +82,9 @@ def test_every_file_is_there_and_nothing_else(result, folder):
     states = {
         f"paraview/{part}_{i:03d}.vtu" for part in ("artery", "jaws") for i in range(len(result.states))
     }
-    figures = {f"figures/{name}.png" for name in FIGURES}
-    expected = {"result.json", "scene.toml", "history.csv", "report.html", "clamping.pvd"} | states | figures
+    figures = {f"figures/{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")}
+    expected = {"README.md", "result.json", "scene.toml", "history.csv", "report.html", "clamping.pvd"}
+    expected |= {"jaw.csv", "jaw.stl"} | states | figures
     assert {path.relative_to(folder).as_posix() for path in files_below(folder)} == expected
 
 
