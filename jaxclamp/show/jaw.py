@@ -20,6 +20,8 @@ from jaxclamp.pictures.fields import jaw_outline
 PROFILE, SOLID = "jaw.csv", "jaw.stl"
 SLIVER = 1e-3
 """points nearer to each other than this part of their mean distance are one"""
+STRAIGHT = 1e-7
+"""sine of an angle that counts as none"""
 
 
 @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # it runs four times
@@ -62,12 +64,20 @@ def _apart(curve: np.ndarray) -> np.ndarray:
     return curve[steps > SLIVER * np.mean(steps)]
 
 
+def _without_straights(polygon: np.ndarray) -> np.ndarray:
+    """The polygon without corners at which it goes straight on: they would make triangles of no area."""
+    before, after = np.roll(polygon, 1, axis=0), np.roll(polygon, -1, axis=0)
+    lengths = np.linalg.norm(polygon - before, axis=1) * np.linalg.norm(after - polygon, axis=1)
+    return polygon[np.abs(_turn(before, polygon, after)) > STRAIGHT * lengths]
+
+
 def solid(section: np.ndarray, half_width: float) -> tuple[np.ndarray, np.ndarray]:
     """A closed surface: the section drawn out over |x| <= half_width, mm; points (2 n, 3), triangles (m, 3).
 
     Seen from outside, the corners of a triangle go anticlockwise: normals point outwards.
     section: corners (z, y), anticlockwise, (n, 2)
     """
+    section = _without_straights(section)
     n = len(section)
     z, y = section.T
     points = np.concatenate([np.stack([np.full(n, x), y, z], axis=1) for x in (-half_width, half_width)])

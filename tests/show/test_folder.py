@@ -26,6 +26,8 @@ JAWS = (
     "flat-2mm",
     "wide-nearly-flat",
     "{ shape = 'flat', half_width_mm = 1.0, edge_radius_mm = 0.02 }",
+    # straight towards its ends, so that its sides tilt
+    "{ shape = 'spline', half_width_mm = 2.0, slopes = [0.0, 0.2, 0.3, 0.3], edge_radius_mm = 0.5 }",
     # two valleys: no other polygon here is concave
     "{ shape = 'spline', half_width_mm = 2.0, slopes = [0.5, -0.3, 0.6, -0.2, 0.4], edge_radius_mm = 0.3 }",
 )
@@ -94,6 +96,7 @@ def test_the_solid_is_closed_with_its_normals_outwards(written):
     gap, slope = gap_and_slope(jaw, np.stack([x, y, z], axis=1)[on_face])
     assert np.abs(gap).max() < 2e-3
     size = np.linalg.norm(normal[on_face], axis=1)
+    assert np.min(np.linalg.norm(normal, axis=1)) > 0.0
     assert np.min(np.sum(normal[on_face] * slope, axis=1) / size) > 0.9
     assert np.abs(mesh.points[:, 0]).max() == pytest.approx(4.0)
 
