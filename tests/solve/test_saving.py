@@ -17,8 +17,8 @@ import jaxclamp as jc
 from jaxclamp.core.records import record
 from jaxclamp.physics.jaws import Cylinder, Jaw
 from jaxclamp.pictures.plots import figures, png
+from jaxclamp.potential.model import build_model
 from jaxclamp.solve import loading, nested
-from jaxclamp.solve.clamping import inflate
 from jaxclamp.solve.saving import HEADER, Header, digest
 
 SMALL = ("mesh.circumferential=3", "mesh.axial=6", "mesh.radial=[2, 1]", "stop.occlusion=0.4")
@@ -116,7 +116,9 @@ def test_numbers_that_no_scene_file_holds_come_back(small, tmp_path):
     points = small.model.potential.layers[0].solid.dV.shape
     c = 27.0 + jnp.linspace(0.0, 1.0, int(np.prod(points))).reshape(points)
     scene = jc.replace(scene, "artery.layers[0].material.c", c)
-    result = inflate(scene)
+    model = build_model(scene)
+    states = tuple(dataclasses.replace(kept, model=model) for kept in small.states)
+    result = dataclasses.replace(small, model=model, states=states)
     again = jc.load_result(result.save(tmp_path / "body.h5"))
     assert again.scene == scene
     assert same(result, again)
