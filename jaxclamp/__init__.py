@@ -7,6 +7,8 @@ from jaxclamp.core.starting import guard_start
 
 guard_start()
 
+from pathlib import Path  # noqa: E402
+
 import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
@@ -56,6 +58,7 @@ from jaxclamp.sensitivity.gradients import gradients  # noqa: E402
 from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
 from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
 from jaxclamp.solve.linear_solvers import cores  # noqa: E402
+from jaxclamp.solve.loading import load_result  # noqa: E402
 from jaxclamp.solve.results import versions  # noqa: E402
 from jaxclamp.trust.estimates import Estimate, Neighbours, neighbours, with_errors  # noqa: E402
 
@@ -96,6 +99,7 @@ __all__ = [
     "jaw_half_width",
     "jaw_travel",
     "kPa",
+    "load_result",
     "load_scene",
     "lumen_area",
     "lumen_height",
@@ -126,3 +130,12 @@ __all__ = [
     "volumes",
     "with_errors",
 ]
+
+
+def _write_outputs(result: Result, folder: Path) -> list[Path]:
+    from jaxclamp.show.export import write_outputs
+
+    return write_outputs(result, folder)
+
+
+Result.write_outputs = _write_outputs

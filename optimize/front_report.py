@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxclamp import Progress, dump_scene
-from jaxclamp.pictures.plots import Plate, png
+from jaxclamp.pictures.plots import Plate, png, svg
 from jaxclamp.pictures.plots.style import AXIAL, CIRCUMFERENTIAL, FAINT, Picture, dress, legend
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
@@ -30,6 +30,7 @@ def write_front(
     for plate in plates_of(found):
         plates.append((plate, png(plate.figure)))
         write_bytes(folder / f"{plate.name}.png", plates[-1][1])
+        write_bytes(folder / f"{plate.name}.svg", svg(plate.figure))
     write_whole(folder / "report.html", page(found, title, plates))
     tell(Progress("writing", 1.0, f"report in {folder}"))
     return [folder / "report.html", folder / "front.png", folder / "study.json"]

@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxclamp import Progress, dump_scene
 from jaxclamp import shown_in as figures_in
-from jaxclamp.pictures.plots import Plate, png
+from jaxclamp.pictures.plots import Plate, png, svg
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
 from optimize.figures import figures, labelled, shown
@@ -45,6 +45,7 @@ def write_study(
     for plate in figures(study):
         plates.append((plate, png(plate.figure)))
         write_bytes(folder / "figures" / f"{plate.name}.png", plates[-1][1])
+        write_bytes(folder / "figures" / f"{plate.name}.svg", svg(plate.figure))
     write_whole(folder / "report.html", page(study, title, plates))
     tell(Progress("writing", 1.0, f"report in {folder}"))
     return [folder / "report.html", folder / "best" / "report.html", folder / "study.json"]

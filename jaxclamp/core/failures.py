@@ -18,7 +18,8 @@ class Failure(Exception):
 
 
 class SceneError(Failure):
-    """A scene or study that is not valid: one sentence with file, key, value and what was expected."""
+    """A scene, study or saved result that is not valid: one sentence with file, key, value and what was
+    expected."""
 
     exit_code = 2
 
@@ -74,6 +75,11 @@ class EquilibriumError(Failure):
         if math.isfinite(self.residual):
             numbers = f" (residual {self.residual:.2g} mN, smallest J {self.J_min:.3g})"
         return f"no equilibrium in stage '{self.stage}', {self.load}: {self.failure}{numbers}; {self.advice}"
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """Stage, load, reason, residual (mN), smallest J, advice: what a file keeps of it."""
+        return self.stage, self.load, self.failure.reason, self.residual, self.J_min, self.advice
 
     def __reduce__(self) -> tuple[Any, ...]:
         return EquilibriumError, (self.stage, self.load, self.failure, self.advice)

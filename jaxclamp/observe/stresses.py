@@ -17,10 +17,17 @@ from jaxclamp.core.records import record
 from jaxclamp.core.tensors import Tensor, components, cross, det, largest_eigenvalue, norm, total
 from jaxclamp.physics.materials import Material
 from jaxclamp.potential.densities import contact_pressure, jaw_gap
-from jaxclamp.potential.energy import State, at_points, gather, group_points, stacked_at_points
+from jaxclamp.potential.energy import (
+    State,
+    at_points,
+    condensed_pressures,
+    gather,
+    group_points,
+    stacked_at_points,
+)
 from jaxclamp.potential.tangent import Piece, cut, joined, whole
 from jaxclamp.potential.terms import JAWS, Group, Potential
-from jaxclamp.potential.wall import kirchhoff_stress
+from jaxclamp.potential.wall import kirchhoff_stress, wall_energy
 
 NOISE, NOISE_OF_BULK = 1e-6, 1e-12
 """a stress below this part of the shear modulus, or of the bulk modulus, is what tolerance and rounding
@@ -44,6 +51,16 @@ def cauchy_stress(cells: Piece) -> tuple[Tensor, Tensor]:
     p = jnp.einsum("mq,mc->qc", cells.pressures.modes, cells.pressures.p)
     sigma = tau / J + jnp.eye(3)[:, :, None, None] * p
     return components(F), components(sigma)
+
+
+def strain_energy(cells: Piece) -> Array:
+    """Strain energy of each cell over its stress-free volume, kPa, (n_cells,), pressures at their best."""
+    solid, known = cells.heres[0], cells.pressures
+    assert known is not None
+    shape, dilated = wall_energy(stacked_at_points(cells.stencil, cells.x), solid)
+    D = jnp.einsum("mq,qc->mc", known.modes, dilated)
+    volume = 0.5 * jnp.sum(D * condensed_pressures(known.stiffness, D), axis=0)
+    return (jnp.sum(shape, axis=0) + volume) / jnp.sum(solid.dV, axis=0)
 
 
 def along(F: Tensor, sigma: Tensor, axis: int) -> Array:

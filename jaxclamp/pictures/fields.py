@@ -46,13 +46,16 @@ class LayerFields:
     cells: np.ndarray
     """point of each cell corner in the element's numbering, (n_en, n_cells)"""
     point_data: dict[str, np.ndarray]
-    """each (n,), or (n, 3) for vectors"""
+    """each (n,), (n, 3) for vectors, or (n, 3, 3) for tensors"""
     cell_data: dict[str, np.ndarray]
     """each (n_cells,)"""
     symmetry: Symmetry
     """the mirror planes that make the whole artery of these points; none if they are all of it"""
     grid: tuple[int, int, int] | None
     """points along (axial, circumferential, radial) in the order of `points`; None after `whole`"""
+    fibres: tuple[np.ndarray, ...] = ()
+    """stress-free direction of each fibre family along the material axes (radial, circumferential, axial) at
+    the points, each (n, 3); see `tensors`"""
 
     def on_grid(self, values: np.ndarray) -> np.ndarray:
         """Values at the points, by grid position (axial, circumferential, radial, ...)."""
@@ -87,7 +90,7 @@ def layer_fields(model: Model, state: State, start: State | None = None) -> tupl
             name: extrapolation(element) @ np.asarray(getattr(s, key)) for name, key in STRESSES.items()
         }
         corners["pressure_kPa"] = pressure[:, first:last]
-        data = {name: _averaged(cells, values, len(nodes)) for name, values in corners.items()}
+        data = {name: averaged(cells, values, len(nodes)) for name, values in corners.items()}
         data["contact_pressure_kPa"] = touch[nodes]
         if start is not None:
             data["displacement_mm"] = x[nodes] - np.asarray(start.x)[nodes]
@@ -114,7 +117,7 @@ def _layer_grid(mesh: Mesh, nodes: np.ndarray) -> tuple[int, int, int]:
     return n_z, n_c, len(nodes) // (n_z * n_c)
 
 
-def _averaged(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+def averaged(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     """Mean at each point of the values its cells have there; cells, values: (n_en, n_cells)."""
     total = np.bincount(cells.ravel(), values.ravel(), n)
     return total / np.bincount(cells.ravel(), minlength=n)
@@ -188,11 +191,38 @@ def whole(layer: LayerFields) -> LayerFields:
         layer,
         points=layer.points[source] * sign,
         cells=np.concatenate(cells, axis=1),
-        point_data={name: v[source] * (sign if v.ndim == 2 else 1) for name, v in layer.point_data.items()},
+        point_data={name: _image(name, v[source], sign) for name, v in layer.point_data.items()},
         cell_data={name: np.tile(v, len(signs)) for name, v in layer.cell_data.items()},
         symmetry=Symmetry(""),
         grid=None,
+        fibres=tuple(v[source] for v in layer.fibres),
     )
+
+
+DEFORMATION = "deformation_gradient"
+"""the tensor whose second index is that of the material axes"""
+
+
+def _image(name: str, values: np.ndarray, sign: np.ndarray) -> np.ndarray:
+    """Point data mirrored in the planes where the sign is -1; sign: (n, 3).
+
+    The material axes of a mirror image are (radial, circumferential, axial) again: reflected in x or y, the
+    circumferential one runs the other way round, reflected in z the axial one.
+    """
+    if values.ndim == 1:
+        return values
+    if values.ndim == 2:
+        return values * sign
+    material = np.stack([np.ones(len(sign)), sign[:, 0] * sign[:, 1], sign[:, 2]], axis=1)
+    return values * sign[:, :, None] * (material if name == DEFORMATION else sign)[:, None]
+
+
+def on_both_sides(layer: LayerFields, name: str, values: np.ndarray) -> np.ndarray:
+    """Tensors (n, 3, 3) at the points with the mean of both sides on mirror planes."""
+    for axis, there in enumerate(_on_planes(layer).T):
+        sign = np.where(np.arange(3) == axis, -1, 1)[None].repeat(np.sum(there), 0)
+        values[there] = 0.5 * (values[there] + _image(name, values[there], sign))
+    return values
 
 
 def _on_planes(layer: LayerFields) -> np.ndarray:

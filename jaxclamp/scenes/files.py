@@ -69,6 +69,14 @@ def dump_scene(scene: Scene) -> str:
     return "\n".join(lines).lstrip("\n") + "\n"
 
 
+def scene_table(scene: Scene) -> dict[str, Any] | None:
+    """The scene as the table that its file holds; None for one that no file can hold."""
+    try:
+        return schema.table(scene)
+    except BadKey:
+        return None
+
+
 def require_possible(scene: Scene) -> None:
     """Refuse a scene made in Python for what a file with its values would be refused for.
 

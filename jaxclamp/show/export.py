@@ -1,8 +1,7 @@
 """Everything a clamping leaves on disk, written whole or not at all.
 
-result.json, scene.toml (complete), history.csv, clamping.pvd with paraview/*.vtu, figures/*.png and
-report.html. All files are made in a temporary folder inside the target and then renamed into place, so that a
-full disk or an interruption leaves the target as it was.
+README.md in the folder says what they are (`show.readme`). All files are made in a temporary folder inside
+the target and then renamed into place, so that a full disk or an interruption leaves the target as it was.
 """
 
 from __future__ import annotations
@@ -22,9 +21,12 @@ import numpy as np
 from jaxclamp.core.failures import SceneError
 from jaxclamp.core.progress import Progress
 from jaxclamp.scenes.files import dump_scene
+from jaxclamp.show import readme
 from jaxclamp.show.console import as_json
+from jaxclamp.show.jaw import PROFILE, SOLID
 from jaxclamp.show.paraview import FOLDER as STATES
 from jaxclamp.show.paraview import write_states
+from jaxclamp.solve.results import flat
 
 if TYPE_CHECKING:
     from jaxclamp.pictures.plots import Plate
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
 STAGING = ".jaxclamp-writing-"
 FIGURES = "figures"
+SCENE = "scene.toml"
 
 
 def write_outputs(
@@ -67,24 +70,28 @@ def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) 
         yield from write_states(result, folder, lambda s, said: tell(0.5 * s, said))
     plates: list[tuple[Plate, bytes]] = []
     (folder / FIGURES).mkdir()
-    from jaxclamp.pictures.plots import figures, png
+    from jaxclamp.pictures.plots import figures, png, svg
 
     for plate in figures(result):
         tell(0.5 + 0.1 * len(plates), plate.title.lower())
         plates.append((plate, png(plate.figure)))
-        path = folder / FIGURES / f"{plate.name}.png"
-        path.write_bytes(plates[-1][1])
-        yield path
+        for suffix, content in (("png", plates[-1][1]), ("svg", svg(plate.figure))):
+            path = folder / FIGURES / f"{plate.name}.{suffix}"
+            path.write_bytes(content)
+            yield path
     history = folder / "history.csv"
     history.write_text(history_csv(result.history), encoding="utf-8", newline="")
     yield history
     from jaxclamp.show.report import write_report
 
     yield write_report(result, folder / "report.html", plates)
-    scene = folder / "scene.toml"
+    scene = folder / SCENE
     with suppress(SceneError):  # constants of each point have no place in a file
         scene.write_text(dump_scene(result.scene), encoding="utf-8")
         yield scene
+    text = folder / readme.NAME
+    text.write_text(readme.readme(result), encoding="utf-8")
+    yield text
     final = folder / "result.json"
     final.write_text(as_json(plain(result.to_dict())) + "\n", encoding="utf-8")
     yield final
@@ -111,12 +118,13 @@ def _remove_old(folder: Path, files: list[Path]) -> None:
 
 
 def _own_files(folder: Path) -> Iterator[Path]:
-    """The states and figures in a folder that bear names given here; a user's own files are others."""
+    """The files in a folder that bear names given here and are not always there; a user's own are others."""
     from jaxclamp.pictures.plots import PLATES
 
     for part in ("artery", "jaws"):
         yield from (folder / STATES).glob(f"{part}_[0-9][0-9][0-9].vtu")
-    yield from (path for name, *_ in PLATES if (path := folder / FIGURES / f"{name}.png").exists())
+    drawn = [f"{FIGURES}/{name}.{suffix}" for name, *_ in PLATES for suffix in ("png", "svg")]
+    yield from (path for name in (*drawn, SCENE, PROFILE, SOLID) if (path := folder / name).exists())
 
 
 # --------------------------------------------------------------------------------- plain content
@@ -135,7 +143,7 @@ def plain(content: Any) -> Any:
 
 def history_csv(history: list[dict[str, Any]]) -> str:
     """One row per state; columns of layers are called KEY.LAYER, of places KEY.LAYER.x and so on."""
-    rows = [dict(_flat(plain(record))) for record in history]
+    rows = [dict(flat(plain(record))) for record in history]
     columns = list(dict.fromkeys(name for row in rows for name in row))
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, ["state", *columns], restval="", lineterminator="\n")
@@ -143,16 +151,6 @@ def history_csv(history: list[dict[str, Any]]) -> str:
     for number, row in enumerate(rows):
         writer.writerow({"state": number, **{name: _cell(value) for name, value in row.items()}})
     return buffer.getvalue()
-
-
-def _flat(record: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in record.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        elif isinstance(value, list):
-            yield from ((f"{prefix}{key}.{axis}", v) for axis, v in zip("xyz", value, strict=False))
-        else:
-            yield prefix + key, value
 
 
 def _cell(value: Any) -> Any:

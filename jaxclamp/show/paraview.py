@@ -1,11 +1,12 @@
 """Every kept state as ParaView files: the artery and the jaws, and one index that opens them all.
 
-The index `clamping.pvd` is a time series over the states in order (time 0 is the load-free state)
-with two parts, the artery and the jaws. All lengths mm, all stresses kPa.
+The index `clamping.pvd` is a series over the states with two parts, the artery and the jaws; its time is the
+occlusion. All lengths mm, all stresses kPa. `show.readme` says what the fields are.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +15,17 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from jaxclamp.pictures.fields import jaw_height_shown, jaw_outline, layer_fields, whole
+from jaxclamp.pictures.tensors import with_fibres, with_tensors
 from jaxclamp.potential.model import Model
+from jaxclamp.show.jaw import write_jaw
 
 if TYPE_CHECKING:
     from jaxclamp.solve.results import Kept, Result
 
 INDEX = "clamping.pvd"
 FOLDER = "paraview"
+BEFORE = -1.0
+"""time of the load-free state, which has no occlusion: before all others"""
 LARGEST_WHOLE = 200_000
 """cells; a finer artery is written as the modelled part"""
 SIDE_MARGIN = 1.15
@@ -30,14 +35,15 @@ SIDE_MARGIN = 1.15
 def write_states(
     result: Result, folder: Path, tell: Callable[[float, str], None] = lambda fraction, message: None
 ) -> list[Path]:
-    """Write all states into `folder`; returns the files, the index last."""
+    """Write all states, and the jaw's face, into `folder`; returns the files."""
     import meshio
 
     (folder / FOLDER).mkdir(exist_ok=True)
     full = is_whole(result.model)
-    outline = jaw_outline(result.scene.clamp.jaw, 2.0 * _widest(result))
-    index: list[tuple[int, str, str]] = []
-    for number, kept in enumerate(result.states):
+    jaw, widest = result.scene.clamp.jaw, _widest(result)
+    outline = jaw_outline(jaw, 2.0 * widest)
+    index: list[tuple[float, str, str]] = []
+    for number, (kept, time) in enumerate(zip(result.states, times(result), strict=True)):
         tell(number / len(result.states), f"state {number + 1} of {len(result.states)}")
         for part, made in (
             ("artery", artery_mesh(result, kept, full)),
@@ -45,9 +51,10 @@ def write_states(
         ):
             name = f"{FOLDER}/{part}_{number:03d}.vtu"
             meshio.write(folder / name, made, compression="zlib")
-            index.append((number, part, name))
+            index.append((time, part, name))
     (folder / INDEX).write_text(pvd(index), encoding="utf-8")
-    return [*(folder / name for _, _, name in index), folder / INDEX]
+    of_jaw = write_jaw(jaw, 2.0 * widest, SIDE_MARGIN * widest, folder)
+    return [*(folder / name for _, _, name in index), folder / INDEX, *of_jaw]
 
 
 def is_whole(model: Model) -> bool:
@@ -55,11 +62,22 @@ def is_whole(model: Model) -> bool:
     return model.symmetry.parts * model.mesh.n_cells <= LARGEST_WHOLE
 
 
-def pvd(index: list[tuple[int, str, str]]) -> str:
+def times(result: Result) -> list[float]:
+    """Time of each state in the series: its occlusion; of two alike, the later one has a last digit more."""
+    found: list[float] = []
+    for kept in result.states:
+        time = BEFORE if kept.stage == "load-free" else float(kept.values["occlusion"])
+        while time in found:
+            time = math.nextafter(time, math.inf)
+        found.append(time)
+    return found
+
+
+def pvd(index: list[tuple[float, str, str]]) -> str:
     """The text of a ParaView collection; index: (time, part, file)."""
     parts = sorted({part for _, part, _ in index})
     rows = [
-        f'    <DataSet timestep="{time}" group="" part="{parts.index(part)}" name={quoteattr(part)} '
+        f'    <DataSet timestep="{time!r}" group="" part="{parts.index(part)}" name={quoteattr(part)} '
         f"file={quoteattr(name)}/>"
         for time, part, name in index
     ]
@@ -82,23 +100,27 @@ def artery_mesh(result: Result, kept: Kept, full: bool = True) -> Any:
 
     load_free = result.load_free_like(kept)
     assert load_free is not None
-    layers = layer_fields(kept.model, kept.state, load_free.state)
-    if full:
-        layers = tuple(whole(layer) for layer in layers)
+    layers = with_tensors(kept.model, kept.state, layer_fields(kept.model, kept.state, load_free.state))
+    layers = with_fibres(tuple(whole(layer) for layer in layers) if full else layers)
     element = kept.model.mesh.element
     starts = np.cumsum([0, *(len(layer.points) for layer in layers)])
     cells = [layer.cells + start for layer, start in zip(layers, starts, strict=False)]
     corners = np.concatenate(cells, axis=1)[list(element.meshio_nodes)].T
+    cell_data = _joined([layer.cell_data for layer in layers])
+    belongs = {f"layer_{layer.name}": cell_data["layer"] == i for i, layer in enumerate(layers, 1)}
+    cell_data |= {name: each.astype(np.uint8) for name, each in belongs.items()}
     return meshio.Mesh(
         np.concatenate([layer.points for layer in layers]),
         [(element.meshio_name, corners)],
         point_data=_joined([layer.point_data for layer in layers]),
-        cell_data={name: [v] for name, v in _joined([layer.cell_data for layer in layers]).items()},
+        cell_data={name: [v] for name, v in cell_data.items()},
     )
 
 
 def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    """Data of all layers; tensors by rows, (n, 9), as mesh files have them."""
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return {name: v.reshape(len(v), 9) if v.ndim == 3 else v for name, v in joined.items()}
 
 
 def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True) -> Any:

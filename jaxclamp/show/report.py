@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxclamp.core.failures import SceneError
 from jaxclamp.fem.symmetry import AXES, Symmetry
 from jaxclamp.observe.figures import shown_in
 from jaxclamp.pictures.fields import layer_fields
@@ -75,8 +76,6 @@ def write_report(result: Result, path: Path, plates: Iterable[tuple[Plate, bytes
 
 def page(result: Result, plates: Iterable[tuple[Plate, bytes]]) -> str:
     """The whole page."""
-    from jaxclamp.scenes.files import dump_scene
-
     content = result.to_dict()
     title = content["title"] or "Clamping of an artery"
     sections = [
@@ -86,10 +85,20 @@ def page(result: Result, plates: Iterable[tuple[Plate, bytes]]) -> str:
         section("Numerical errors", _errors(content["errors"])),
         section("Checks", _checks(checks(result))),
         section("Model", _model(content["model"])),
-        section("Scene", f"<pre>{escape(dump_scene(result.scene))}</pre>"),
+        section("Scene", _scene(result)),
         section("Cost and versions", _cost(content)),
     ]
     return document(title, sections)
+
+
+def _scene(result: Result) -> str:
+    """The scene as TOML."""
+    from jaxclamp.scenes.files import dump_scene
+
+    try:
+        return f"<pre>{escape(dump_scene(result.scene))}</pre>"
+    except SceneError as error:  # constants of each point
+        return f"<p>{escape(str(error))}</p>"
 
 
 def document(title: str, sections: Iterable[str]) -> str:

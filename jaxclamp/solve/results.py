@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
+import math
 import platform
+from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError
 from jaxclamp.observe.equilibria import Equilibria
@@ -16,6 +21,7 @@ from jaxclamp.observe.measures import PEAK_SHARPNESS
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
+from jaxclamp.scenes.files import scene_table
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import ROUNDING, work
 from jaxclamp.solve.linear_solvers import Factors
@@ -41,6 +47,10 @@ class Kept:
     """as in result.json: floats, and one dict per layer for peaks"""
     model: Model
     """what it is an equilibrium of: states of the closing path may be of a coarser mesh than the last"""
+
+    def __repr__(self) -> str:
+        """Its stage, and how far the lumen is closed."""
+        return f"<{self.stage} state: {_brief(self.values)}>"
 
     @property
     def state(self) -> State:
@@ -70,10 +80,19 @@ class Result:
     """the same on the coarser mesh on which its closing path was walked; None if that was its own"""
     errors: dict[str, dict[str, float | None]] | None = None
     """how far the main figures may be off, see `jaxclamp.trust.estimates`; None if it was not asked for"""
+    versions: dict[str, str] = dataclasses.field(default_factory=lambda: versions())
+    """of what its numbers depend on, where they were made"""
+
+    write_outputs: ClassVar[Callable[[Result, Path], list[Path]]]
+    """what `write` does; given by the package's door, because it lies above"""
 
     def __repr__(self) -> str:
         """What came of it, and whether it is known how far its figures may be off."""
-        reached = f"{len(self.states)} states" if self.converged else f"not converged, {self.failure}"
+        reached = f"{len(self.states)} states"
+        if self.states:
+            reached += f", {_brief(self.states[-1].values)}"
+        if self.failure is not None:
+            reached += f"; NOT CONVERGED in stage '{self.failure.stage}', see .failure"
         known = "not estimated, see jaxclamp.with_errors" if self.errors is None else "in .errors"
         return f"<Result of {self.scene.title!r}: {reached}; numerical errors: {known}>"
 
@@ -163,6 +182,37 @@ class Result:
             }
         )
 
+    def history_table(self) -> dict[str, np.ndarray]:
+        """The history by column, each (n_states,): made for `pandas.DataFrame` and the like.
+
+        Columns are called as in history.csv: name and unit (`clamp_force_N`), with the layer's name behind
+        (`peak_axial_stress_kPa.media`) and the axis of a place (`peak_axial_stress_location_mm.media.z`).
+        Numbers that are not defined are nan.
+        """
+        rows = [dict(flat(record)) for record in self.history]
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        return {name: np.array([_number(row.get(name)) for row in rows]) for name in names}
+
+    # --- files ----------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> Path:
+        """Write everything to one HDF5 file that `jaxclamp.load_result` reads back; returns where it is.
+
+        States, scene, history, errors and failure, to the last bit. Raises OSError, with nothing half
+        written; SceneError for a scene that could not be read back.
+        """
+        from jaxclamp.solve.saving import save
+
+        return save(self, path)
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write what `jaxclamp run --out` leaves into a folder (made if missing); returns the files.
+
+        README.md in it says what they are. Files of an earlier result there are replaced. Raises OSError,
+        with nothing half written.
+        """
+        return Result.write_outputs(self, Path(folder))
+
     def to_dict(self) -> dict[str, Any]:
         """The content of result.json."""
         scene = self.scene
@@ -171,6 +221,7 @@ class Result:
             "title": scene.title,
             "converged": self.converged,
             "failure": None if self.failure is None else str(self.failure),
+            "scene": scene_table(scene),
             "load_free": {
                 "lumen_radius_mm": _radius(load_free),
                 "outer_radius_mm": load_free and load_free.values["outer_radius_mm"],
@@ -195,7 +246,7 @@ class Result:
             },
             "solver": self.solver,
             "cost": self.cost,
-            "versions": versions(),
+            "versions": self.versions,
         }
 
     # --- figures: matplotlib is imported when one is drawn ------------------------------------------
@@ -229,6 +280,27 @@ class Result:
         from jaxclamp.pictures import plots
 
         return plots.plot_force_travel(self)
+
+
+def flat(record: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """A record's numbers by column: KEY, KEY.LAYER, and KEY.LAYER.x and so on for places."""
+    for key, value in record.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        elif isinstance(value, list | tuple):
+            yield from ((f"{prefix}{key}.{axis}", v) for axis, v in zip("xyz", value, strict=False))
+        else:
+            yield prefix + key, value
+
+
+def _number(value: Any) -> Any:
+    return math.nan if value is None else value
+
+
+def _brief(values: dict[str, Any]) -> str:
+    """The main figures of a state in a few words."""
+    occlusion, force = values["occlusion"], values["clamp_force_N"]
+    return f"occlusion {occlusion:.1%}, jaw force {force:.3g} N"
 
 
 def _radius(kept: Kept | None) -> float | None:

@@ -82,8 +82,9 @@ def test_every_file_is_there_and_nothing_else(result, folder):
     states = {
         f"paraview/{part}_{i:03d}.vtu" for part in ("artery", "jaws") for i in range(len(result.states))
     }
-    figures = {f"figures/{name}.png" for name in FIGURES}
-    expected = {"result.json", "scene.toml", "history.csv", "report.html", "clamping.pvd"} | states | figures
+    figures = {f"figures/{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")}
+    expected = {"README.md", "result.json", "scene.toml", "history.csv", "report.html", "clamping.pvd"}
+    expected |= {"jaw.csv", "jaw.stl"} | states | figures
     assert {path.relative_to(folder).as_posix() for path in files_below(folder)} == expected
 
 
@@ -132,7 +133,8 @@ def test_index_names_every_state_of_both_parts(result, folder):
     root = ET.parse(folder / "clamping.pvd").getroot()
     assert (root.tag, root.attrib["type"]) == ("VTKFile", "Collection")
     entries = [entry.attrib for entry in root.iter("DataSet")]
-    assert sorted({float(entry["timestep"]) for entry in entries}) == list(range(len(result.states)))
+    times = list(dict.fromkeys(float(entry["timestep"]) for entry in entries))
+    assert times == [-1.0, *(record["occlusion"] for record in result.history)]
     assert {(entry["part"], entry["name"]) for entry in entries} == {("0", "artery"), ("1", "jaws")}
     assert len(entries) == 2 * len(result.states)
     assert all((folder / entry["file"]).is_file() for entry in entries)

@@ -132,15 +132,6 @@ def test_differences_may_step_over_the_end_of_a_range():
         require_computable(jc.replace(small(), "artery.layers[0].thickness", -1e-12))
 
 
-def test_a_result_says_how_to_get_its_errors():
-    result = jc.clamp(small())
-    assert repr(result) == (
-        f"<Result of 'Human LAD between two cylinders': {len(result.states)} states; "
-        "numerical errors: not estimated, see jaxclamp.with_errors>"
-    )
-    assert repr(dataclasses.replace(result, errors={})).endswith("numerical errors: in .errors>")
-
-
 @record
 class Upside(Jaw):
     """A bar whose gap has the wrong sign."""

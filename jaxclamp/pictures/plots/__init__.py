@@ -12,7 +12,7 @@ from jaxclamp.pictures.plots.curves import plot_force_travel, plot_stress_at_P
 from jaxclamp.pictures.plots.maps import plot_axial_stress_maps
 from jaxclamp.pictures.plots.sections import plot_sections
 from jaxclamp.pictures.plots.states import Clamped
-from jaxclamp.pictures.plots.style import Picture, png
+from jaxclamp.pictures.plots.style import Picture, png, svg
 from jaxclamp.pictures.plots.wall import plot_wall_stress
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "plot_stress_at_P",
     "plot_wall_stress",
     "png",
+    "svg",
 ]
 
 

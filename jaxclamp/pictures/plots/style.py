@@ -46,6 +46,13 @@ def png(figure: Figure, dots_per_inch: int = DOTS_PER_INCH) -> bytes:
     return buffer.getvalue()
 
 
+def svg(figure: Figure) -> bytes:
+    """The figure as an SVG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Creator": None, "Date": None})
+    return buffer.getvalue()
+
+
 def dress(axes: Axes, x: str = "", y: str = "", title: str = "", grid: bool = True) -> None:
     """Labels, ticks and frame of a graph."""
     axes.set_xlabel(x, fontsize=NORMAL, color=INK)
