@@ -37,6 +37,7 @@ from jaxclamp.observe.measures import (  # noqa: E402
     stored_energy,
     volume_above,
 )
+from jaxclamp.observe.parts import import_parts  # noqa: E402
 from jaxclamp.observe.points import (  # noqa: E402
     cauchy_stress,
     contact_pressures,
@@ -92,6 +93,7 @@ __all__ = [
     "dump_scene",
     "evaluate",
     "gradients",
+    "import_parts",
     "jaw_curvature",
     "jaw_half_width",
     "jaw_travel",

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from jaxclamp.core.failures import EquilibriumError
+from jaxclamp.core.parts import own_parts
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import FIGURES
 from jaxclamp.observe.measure import Measure, require_measure
@@ -195,6 +196,7 @@ class Result:
             },
             "solver": self.solver,
             "cost": self.cost,
+            "own_parts": own_parts(scene),
             "versions": versions(),
         }
 
