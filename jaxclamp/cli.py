@@ -183,12 +183,18 @@ def run(
     folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-result")
     if folder is not None:
         _check_folder(folder)
+    from jaxclamp.scenes.notes import notes
+
+    unlikely = notes(loaded)
+    _tell(unlikely, quiet)
     result, failure = _solve(loaded, quiet)
     files = _write(result, folder, quiet) if result is not None and folder is not None else []
     if result is not None and as_json:
         typer.echo(console.as_json(result.to_dict()))
     elif result is not None and not quiet:
         typer.echo("\n".join(console.summary(result.to_dict(), files)))
+    if result is not None:
+        _tell([note for note in result.to_dict().get("notes", ()) if note not in unlikely], quiet)
     if failure is not None:
         kept = f" (the states that converged are in {folder})" if files else ""
         return _fail(f"{failure}{kept}", failure.exit_code)
@@ -289,6 +295,11 @@ def _import(files: list[str] | None) -> None:
     with redirect_stdout(sys.stderr):
         for file in files or ():
             import_parts(file)
+
+
+def _tell(notes: list[str], quiet: bool) -> None:
+    for note in () if quiet else notes:
+        typer.echo(f"note: {note}", err=True)
 
 
 def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:

@@ -164,7 +164,7 @@ def _refuse_unknown(table: dict[str, Any], known: list[str], path: str, of: str 
     for key in table:
         if key not in known:
             place = f"{path}.{shortened(bare(key))}" if path else shortened(bare(key))
-            raise BadKey(f"unknown key {place}{of}; {did_you_mean(key, known)}")
+            raise BadKey(f"unknown key {place}{of}; {did_you_mean(key, known, table[key])}")
 
 
 def _read_record(cls: type, table: dict[str, Any], path: str, of: str = "") -> Any:

@@ -17,6 +17,7 @@ from jaxclamp.observe.measures import PEAK_SHARPNESS
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
+from jaxclamp.scenes.notes import notes, notes_of_states
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import ROUNDING, work
 from jaxclamp.solve.linear_solvers import Factors
@@ -196,6 +197,7 @@ class Result:
             },
             "solver": self.solver,
             "cost": self.cost,
+            "notes": notes(scene) + notes_of_states(self.history),
             "own_parts": own_parts(scene),
             "versions": versions(),
         }
