@@ -48,7 +48,7 @@ from jaxclamp.observe.points import (  # noqa: E402
 )
 from jaxclamp.observe.stops import ForceStop, OcclusionStop, TravelStop  # noqa: E402
 from jaxclamp.physics.jaws import Jaw  # noqa: E402
-from jaxclamp.physics.materials import Material  # noqa: E402
+from jaxclamp.physics.materials import FibreLaw, Material  # noqa: E402
 from jaxclamp.scenes.address import replace  # noqa: E402
 from jaxclamp.scenes.files import dump_scene, load_scene, require_possible  # noqa: E402
 from jaxclamp.scenes.scene import Scene, Stop  # noqa: E402
@@ -66,6 +66,7 @@ __all__ = [
     "EquilibriumError",
     "Estimate",
     "Failure",
+    "FibreLaw",
     "ForceStop",
     "Jaw",
     "Material",
