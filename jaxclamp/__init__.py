@@ -39,6 +39,7 @@ from jaxclamp.observe.measures import (  # noqa: E402
     stored_energy,
     volume_above,
 )
+from jaxclamp.observe.parts import import_parts  # noqa: E402
 from jaxclamp.observe.points import (  # noqa: E402
     cauchy_stress,
     contact_pressures,
@@ -49,7 +50,7 @@ from jaxclamp.observe.points import (  # noqa: E402
 )
 from jaxclamp.observe.stops import ForceStop, OcclusionStop, TravelStop  # noqa: E402
 from jaxclamp.physics.jaws import Jaw  # noqa: E402
-from jaxclamp.physics.materials import Material  # noqa: E402
+from jaxclamp.physics.materials import FibreLaw, Material  # noqa: E402
 from jaxclamp.scenes.address import replace  # noqa: E402
 from jaxclamp.scenes.files import dump_scene, load_scene, require_possible  # noqa: E402
 from jaxclamp.scenes.scene import Scene, Stop  # noqa: E402
@@ -68,6 +69,7 @@ __all__ = [
     "EquilibriumError",
     "Estimate",
     "Failure",
+    "FibreLaw",
     "ForceStop",
     "Jaw",
     "Material",
@@ -95,6 +97,7 @@ __all__ = [
     "dump_scene",
     "evaluate",
     "gradients",
+    "import_parts",
     "jaw_curvature",
     "jaw_half_width",
     "jaw_travel",

@@ -11,7 +11,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,6 +51,14 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option(
         "--set", metavar="KEY=VALUE", help="Override one key, e.g. clamp.jaw.radius_mm=1.5; repeatable."
+    ),
+]
+ImportOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--import",
+        metavar="FILE.py",
+        help="Python file of your own jaws, laws, stops and measures, which files may then name; repeatable.",
     ),
 ]
 OutOption = Annotated[
@@ -139,6 +147,7 @@ def show(
     scene: SceneArgument,
     fidelity: FidelityOption = None,
     overrides: SetOption = None,
+    parts: ImportOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -146,6 +155,7 @@ def show(
     from jaxclamp.core.surroundings import use_cpu
 
     use_cpu()
+    _import(parts)
     loaded = _load(scene, fidelity, overrides, quiet)
     from jaxclamp.show.description import describe
 
@@ -163,20 +173,28 @@ def run(
     out: OutOption = None,
     fidelity: FidelityOption = None,
     overrides: SetOption = None,
+    parts: ImportOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
     """Clamp an artery: stress-free, load-free, physiological, clamped to the stop."""
+    _import(parts)
     loaded = _load(scene, fidelity, overrides, quiet)
     folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-result")
     if folder is not None:
         _check_folder(folder)
+    from jaxclamp.scenes.notes import notes
+
+    unlikely = notes(loaded)
+    _tell(unlikely, quiet)
     result, failure = _solve(loaded, quiet)
     files = _write(result, folder, quiet) if result is not None and folder is not None else []
     if result is not None and as_json:
         typer.echo(console.as_json(result.to_dict()))
     elif result is not None and not quiet:
         typer.echo("\n".join(console.summary(result.to_dict(), files)))
+    if result is not None:
+        _tell([note for note in result.to_dict().get("notes", ()) if note not in unlikely], quiet)
     if failure is not None:
         kept = f" (the states that converged are in {folder})" if files else ""
         return _fail(f"{failure}{kept}", failure.exit_code)
@@ -193,6 +211,7 @@ def optimise(
         typer.Option("--out", metavar="DIR", help="Folder for the study.", show_default="./STUDY-study"),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the study in that folder.")] = False,
+    parts: ImportOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
@@ -200,6 +219,7 @@ def optimise(
     from optimize.report import warning, write_found
     from optimize.study_file import load_study
 
+    _import(parts)
     asked = load_study(study)
     folder = out or Path(f"{Path(study).stem}-study")
     _check_folder(folder)
@@ -225,10 +245,12 @@ def accuracy(
     ] = None,
     fidelity: FidelityOption = None,
     overrides: SetOption = None,
+    parts: ImportOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> int:
     """What accuracy costs: error against time and memory over mesh, element, penalties and solver."""
+    _import(parts)
     loaded = _load(scene, fidelity, overrides, quiet)
     folder = out or Path(f"{Path(scene).stem}-accuracy")
     _check_folder(folder)
@@ -264,6 +286,20 @@ def presets(
 
 
 # ---------------------------------------------------------------------------------- steps of run
+
+
+def _import(files: list[str] | None) -> None:
+    """Run a user's files of parts; what they print is no result."""
+    from jaxclamp.observe.parts import import_parts
+
+    with redirect_stdout(sys.stderr):
+        for file in files or ():
+            import_parts(file)
+
+
+def _tell(notes: list[str], quiet: bool) -> None:
+    for note in () if quiet else notes:
+        typer.echo(f"note: {note}", err=True)
 
 
 def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxclamp import EquilibriumError, Measure, Progress, Result, SceneError, clamp, versions
+from jaxclamp.core.parts import own_parts
 from optimize.journal import Journal
 from optimize.named_measures import in_words
 from optimize.problem import Constraint, DesignProblem
@@ -123,6 +124,9 @@ class Front:
             ],
             **{name: {"objectives": list(values)} for name, values in self.others.items()},
             "cost": {"wall_s": self.seconds},
+            "own_parts": own_parts(
+                self.problem.scene, self.problem.reference, self.problem.measures, self.second
+            ),
             "versions": versions(),
         }
 

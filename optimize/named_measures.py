@@ -9,14 +9,13 @@ from typing import Any
 
 import jaxclamp as jc
 from jaxclamp import Measure, SceneError
+from jaxclamp.observe.parts import example_of, measures
 from jaxclamp.scenes.schema import shown
 from jaxclamp.scenes.wording import did_you_mean, shortened
 from optimize.numbers import MOST, number
 
 FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
 """internal unit -> unit in files, and internal units in one of it; the others are the same"""
-
-_EXAMPLE: dict[str, Any] = {"layer": "media", "stress": 1.0}
 
 
 def _layer(value: Any, path: str, layers: tuple[str, ...]) -> str:
@@ -58,14 +57,15 @@ class Named:
 
 
 def named() -> dict[str, Named]:
-    """The measures of `jaxclamp` that a file can name, by their key, such as "clamp_force_N"."""
+    """The measures that a file can name, shipped or of files that were imported, by their key, such as
+    "clamp_force_N"."""
     found = {}
-    for factory in jc.MEASURES:
-        example = factory(**{name: _EXAMPLE[name] for name in inspect.signature(factory).parameters})
+    for factory in measures():
+        example = example_of(factory)
         if not example.needs_stop:  # no design of a clamp changes it
             continue
         unit, factor = FILE_UNIT.get(example.unit, (example.unit, 1.0))
-        key = f"{example.name}_{unit}" if unit else example.name
+        key = f"{factory.__name__}_{unit}" if unit else factory.__name__
         found[key] = Named(key, factory, factor)
     return found
 

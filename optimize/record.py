@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxclamp import dump_scene, versions
+from jaxclamp.core.parts import own_parts
 from optimize.problem import DesignProblem
 
 FEASIBLE = 1e-3
@@ -57,6 +58,7 @@ class Record:
         parts = [dump_scene(p.scene), str(p.objective), self.method, repr(p.entries)]
         parts += [f"{c.measure} {c.lower} {c.upper}" for c in p.constraints]
         parts += [f"rising {p.rises.tolist()}"] if p.rises.size else []
+        parts += [str(own["sha256"]) for own in self._own_parts()]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
     def best(self) -> Evaluation | None:
@@ -120,8 +122,13 @@ class Record:
             "stopped_because": stopped_because,
             "verified_on_finer_mesh": verification,
             "cost": {"wall_s": seconds},
+            "own_parts": self._own_parts(),
             "versions": versions(),
         }
+
+    def _own_parts(self) -> list[dict[str, str | None]]:
+        """What the study needs that is not shipped."""
+        return own_parts(self.problem.scene, self.problem.reference, self.problem.measures)
 
     def _design(self, best: np.ndarray | None) -> dict[str, Any]:
         """The variables with bounds, start and best, in file units."""

@@ -42,7 +42,7 @@ def take_over(record: Record, journal: Journal | None, tell: Callable[[Progress]
         raise SceneError(f"{path}: damaged, its fingerprint is missing or is no text; {WAY_OUT}")
     if found["fingerprint"] != record.fingerprint:
         raise SceneError(
-            f"{path}: the study in that folder is another one: its scene, variables or method differ"
+            f"{path}: the study in that folder is another one: scene, variables, own parts or method differ"
         )
     record.evaluations += _evaluations(found.get("iterations"), record, path)
     said = other_versions(found.get("versions"))

@@ -26,6 +26,7 @@ from jaxclamp import (
     cores,
     require_possible,
 )
+from jaxclamp.core.parts import call, packed
 from optimize.drivers import METHODS, Enough
 from optimize.evaluator import Evaluator
 from optimize.journal import Journal
@@ -114,11 +115,14 @@ def elsewhere(
     try:
         yield [
             pool.submit(
-                from_another_start,
-                dataclasses.replace(problem, scene=problem.scene_at(design)),
-                budget,
-                None if folder is None else folder / f"start-{number}",
-                resume,
+                call,
+                packed(
+                    from_another_start,
+                    dataclasses.replace(problem, scene=problem.scene_at(design)),
+                    budget,
+                    None if folder is None else folder / f"start-{number}",
+                    resume,
+                ),
             )
             for number, design in enumerate(other_starts(problem, count), 2)
         ]

@@ -14,11 +14,14 @@ item by item.
 
 from __future__ import annotations
 
+import copyreg
 import dataclasses
+import inspect
 import math
 import weakref
 from collections.abc import Callable
-from typing import Any, TypeVar, dataclass_transform
+from contextlib import suppress
+from typing import Any, TypeVar, dataclass_transform, get_type_hints
 
 import jax
 import numpy as np
@@ -93,14 +96,22 @@ def static(default: Any = dataclasses.MISSING, choices: tuple[str, ...] = ()) ->
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(quantity, static))
 def record(cls: type[Record]) -> type[Record]:
     """Make `cls` a frozen, keyword-only dataclass and a JAX pytree, with `==` that gives a bool."""
+    with suppress(NameError):  # here their names are known; not where the class may travel to
+        hints = get_type_hints(cls)
+        cls.__annotations__ = {name: hints[name] for name in inspect.get_annotations(cls)}
     frozen: Any = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
     frozen.__eq__, frozen.__hash__, frozen.__reduce__ = _equal, _hash, _reduce
     _make_known(frozen)
     return frozen
 
 
+# "no default" is one object, which classes of records that travel have to find again
+copyreg.pickle(type(dataclasses.MISSING), lambda _: "MISSING")
+
 _known: weakref.WeakSet[type] = weakref.WeakSet()
 """the records that JAX of this process sees as pytrees"""
+_withdrawn: weakref.WeakSet[type] = weakref.WeakSet()
+"""the records that are no longer to be found below their bases"""
 
 
 def _make_known(cls: type[Any]) -> None:
@@ -161,9 +172,14 @@ def concrete_subclasses(base: type) -> list[type]:
     found: list[type] = []
     below: list[type] = base.__subclasses__()
     for cls in below:
-        found += [cls] if "__dataclass_fields__" in vars(cls) else []
+        found += [cls] if "__dataclass_fields__" in vars(cls) and cls not in _withdrawn else []
         found += concrete_subclasses(cls)
     return found
+
+
+def withdraw(cls: type) -> None:
+    """Have a record no longer found below its base; values of it stay what they are."""
+    _withdrawn.add(cls)
 
 
 def shape_of(tree: Any, describe: Callable[[Any], Any] = lambda leaf: getattr(leaf, "shape", ())) -> Any:

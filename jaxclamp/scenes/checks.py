@@ -93,7 +93,7 @@ def check_closing(scene: Scene) -> None:
     """Every layer's open sector closes to a ring, round the one inside."""
     inner_squared: float | None = None
     for i, layer in enumerate(scene.artery.layers):
-        inner_squared, stretch = _close(layer, inner_squared, f"artery.layers[{i}].opening_angle_deg")
+        inner_squared, stretch = closed(layer, inner_squared, f"artery.layers[{i}].opening_angle_deg")
         least, most = CLOSING_STRETCHES
         if not least <= stretch <= most:
             raise refuse(
@@ -104,7 +104,7 @@ def check_closing(scene: Scene) -> None:
             )
 
 
-def _close(layer: Layer, inner_squared: float | None, path: str) -> tuple[float, float]:
+def closed(layer: Layer, inner_squared: float | None, path: str) -> tuple[float, float]:
     """Square of the closed outer radius (mm2) and mean circumferential stretch of one layer.
 
     The map of `fem.tube.closed_radii`: r**2 = r_i**2 + (R**2 - R_i**2) / k, where the innermost

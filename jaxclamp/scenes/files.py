@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxclamp.core.failures import BadKey, SceneError
+from jaxclamp.core.parts import own_parts
 from jaxclamp.core.surroundings import require_fit
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.scenes import schema
@@ -61,9 +62,10 @@ def dump_scene(scene: Scene) -> str:
     """The scene as TOML, every key written out; `loads_scene` gives the same scene again.
 
     Exact to the last bit for every scene that came from a file (an angle set in Python may move
-    by one part in 1e16). Raises SceneError for a scene that no file can hold, with arrays of constants.
+    by one part in 1e16). Above it stands which parts of a user's own it needs. Raises SceneError for a scene
+    that no file can hold, with arrays of constants.
     """
-    lines: list[str] = []
+    lines = _needs(scene)
     with _refusals("scene"):
         _emit(schema.table(scene), "", lines)
     return "\n".join(lines).lstrip("\n") + "\n"
@@ -75,6 +77,15 @@ def scene_table(scene: Scene) -> dict[str, Any] | None:
         return schema.table(scene)
     except BadKey:
         return None
+
+
+def _needs(scene: Scene) -> list[str]:
+    """A comment for each part that is not shipped."""
+    said = []
+    for part in own_parts(scene):
+        where = schema.quoted(Path(str(part["from"])).name)
+        said.append(f"# needs {part['part']} of {where}" + (" (--import)" if part["sha256"] else ""))
+    return said
 
 
 def require_possible(scene: Scene) -> None:

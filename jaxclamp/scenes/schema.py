@@ -19,6 +19,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 
 from jaxclamp.core.failures import BadKey
+from jaxclamp.core.parts import is_shipped
 from jaxclamp.core.records import UNIT_FACTOR, Range, concrete_subclasses
 from jaxclamp.scenes.wording import did_you_mean, nearest, shortened
 
@@ -84,8 +85,8 @@ def owners(base: type) -> dict[str, type]:
 
 
 def tag_of(cls: type) -> tuple[str, str]:
-    """Name and value of the tag of a record class."""
-    return next((f.name, str(f.default)) for f in dataclasses.fields(cls) if is_tag(f))
+    """Name and value of the tag of a record class; blank for one without."""
+    return next(((f.name, str(f.default)) for f in dataclasses.fields(cls) if is_tag(f)), ("", ""))
 
 
 def is_required(field: dataclasses.Field[Any], hint: Any) -> bool:
@@ -124,7 +125,13 @@ def _main_keys(kind: Any) -> str:
 
 
 def _tags(base: type) -> dict[str, type]:
-    return {tag_of(cls)[1]: cls for cls in concrete_subclasses(base)}
+    """The records below a base by their tag; of two that share one, the shipped one, else the last."""
+    found: dict[str, type] = {}
+    for cls in concrete_subclasses(base):
+        tag = tag_of(cls)[1]
+        if tag and not (tag in found and is_shipped(found[tag])):
+            found[tag] = cls
+    return found
 
 
 def _listed(words: Any) -> str:
@@ -157,7 +164,7 @@ def _refuse_unknown(table: dict[str, Any], known: list[str], path: str, of: str 
     for key in table:
         if key not in known:
             place = f"{path}.{shortened(bare(key))}" if path else shortened(bare(key))
-            raise BadKey(f"unknown key {place}{of}; {did_you_mean(key, known)}")
+            raise BadKey(f"unknown key {place}{of}; {did_you_mean(key, known, table[key])}")
 
 
 def _read_record(cls: type, table: dict[str, Any], path: str, of: str = "") -> Any:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import chain
+from typing import Any
 
 from jaxclamp.core.records import UNIT_FACTOR
 
@@ -63,13 +65,22 @@ def nearest(word: str, known: Sequence[str]) -> str | None:
     return next(iter(same + close), None)
 
 
-def did_you_mean(word: str, known: Sequence[str]) -> str:
-    """'did you mean X?', with the conversion of a wrong unit, or what is known where nothing is near."""
+def did_you_mean(word: str, known: Sequence[str], value: Any = None) -> str:
+    """'did you mean X?', with the conversion of a wrong unit, or what is known where nothing is near.
+
+    value: what was given under that name, which is converted too if it is a number
+    """
     near = nearest(word, known)
     if near is None:
         more = ", ..." if len(known) > MOST_KNOWN else ""
         return f"known here: {', '.join(shortened(k) for k in known[:MOST_KNOWN])}{more}"
-    return f"did you mean {shortened(near)}?{_about_units(split_unit(word)[1], split_unit(near)[1])}"
+    given, expected = split_unit(word)[1], split_unit(near)[1]
+    target, factor = CONVERSIONS.get(given, ("", 1.0))
+    said = f"did you mean {shortened(near)}?{_about_units(given, expected)}"
+    if target and target == expected and isinstance(value, int | float) and not isinstance(value, bool):
+        with suppress(OverflowError):  # digits in hundreds
+            said += f": {shortened(near)} = {value * factor:.6g}"
+    return said
 
 
 def _about_units(given: str, expected: str) -> str:

@@ -10,6 +10,7 @@ from jaxclamp.fem.symmetry import symmetry_of
 from jaxclamp.fem.tube import axial_fractions, build_tube, end_height
 from jaxclamp.potential.terms import needed
 from jaxclamp.scenes.fitting import fitting_contact
+from jaxclamp.scenes.notes import notes
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.linear_solvers import available
 from jaxclamp.solve.memory import predicted_MB, unknowns_of
@@ -48,6 +49,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "predicted_seconds": _rounded(seconds),
         "predicted_memory_MB": _rounded(predicted_MB(unknowns)),
         "warnings": warnings(scene),
+        "notes": notes(scene),
     }
 
 

@@ -84,6 +84,7 @@ def page(result: Result, plates: Iterable[tuple[Plate, bytes]]) -> str:
         section("Numbers", _numbers(content, result)),
         section("Numerical errors", _errors(content["errors"])),
         section("Checks", _checks(checks(result))),
+        section("Notes", _notes(content["notes"])),
         section("Model", _model(content["model"])),
         section("Scene", _scene(result)),
         section("Cost and versions", _cost(content)),
@@ -312,6 +313,12 @@ def _checks(found: list[tuple[str, str, str, bool]]) -> str:
     return (
         f'<div class="scroll"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>' if rows else ""
     )
+
+
+def _notes(notes: list[str]) -> str:
+    """The notes on what is unlikely; nothing if there are none."""
+    items = "".join(f"<li>{escape(note)}</li>\n" for note in notes)
+    return f"<ul>{items}</ul>" if items else ""
 
 
 def _model(model: dict[str, Any]) -> str:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError
+from jaxclamp.core.parts import own_parts
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import FIGURES
 from jaxclamp.observe.measure import Measure, require_measure
@@ -22,6 +23,7 @@ from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
 from jaxclamp.scenes.files import scene_table
+from jaxclamp.scenes.notes import notes, notes_of_states
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import ROUNDING, work
 from jaxclamp.solve.linear_solvers import Factors
@@ -246,6 +248,8 @@ class Result:
             },
             "solver": self.solver,
             "cost": self.cost,
+            "notes": notes(scene) + notes_of_states(self.history),
+            "own_parts": own_parts(scene),
             "versions": self.versions,
         }
 

@@ -327,11 +327,17 @@ def test_a_forgotten_unit_is_suggested():
     [
         (
             ("artery", "pressure_mmHg"),
-            "artery.pressure_mmHg; did you mean pressure_kPa? (1 mmHg = 0.133322 kPa)",
+            "pressure_mmHg; did you mean pressure_kPa? (1 mmHg = 0.133322 kPa): pressure_kPa = 0.399966",
         ),
-        (("artery", "layers", 1, "thickness_um"), "did you mean thickness_mm? (1 um = 0.001 mm)"),
-        (("artery", "layers", 0, "material", "c_MPa"), "did you mean c_kPa? (1 MPa = 1000 kPa)"),
-        (("stop", "force_mN"), "did you mean force_N? (1 mN = 0.001 N)"),
+        (
+            ("artery", "layers", 1, "thickness_um"),
+            "did you mean thickness_mm? (1 um = 0.001 mm): thickness_mm = 0.003",
+        ),
+        (
+            ("artery", "layers", 0, "material", "c_MPa"),
+            "did you mean c_kPa? (1 MPa = 1000 kPa): c_kPa = 3000",
+        ),
+        (("stop", "force_mN"), "did you mean force_N? (1 mN = 0.001 N): force_N = 0.003"),
     ],
 )
 def test_a_wrong_unit_is_refused_with_the_right_one(path, words):

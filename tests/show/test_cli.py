@@ -17,6 +17,8 @@ import pytest
 from jaxclamp.cli import main
 from jaxclamp.core.failures import EquilibriumError, NoReference, NotConverged, SceneError
 from jaxclamp.scenes.fidelity import mesh_for
+from jaxclamp.scenes.files import load_scene
+from jaxclamp.scenes.notes import notes
 from jaxclamp.scenes.presets import presets
 from jaxclamp.show import console
 from jaxclamp.show import export as real_export
@@ -151,6 +153,26 @@ def test_run_warns_of_another_equilibrium(engine, capsys):
     assert "jaxclamp: warning: another equilibrium: unstable\n" in err
     engine.outcome = FakeResult()
     assert call(capsys, "run", "human-lad", "--quiet")[2] == ""
+
+
+class Noted(FakeResult):
+    """A result with a note on its scene and one on its states."""
+
+    def to_dict(self):
+        scene = load_scene("human-lad", ["artery.pressure_kPa=100"])
+        return super().to_dict() | {"notes": [*notes(scene), "J is far from 1"]}
+
+
+def test_run_notes_what_is_unlikely_once(engine, capsys):
+    engine.outcome = Noted()
+    command = ["run", "human-lad", "--set", "artery.pressure_kPa=100", "--json"]
+    code, _, err = call(capsys, *command)
+    told = [line for line in err.splitlines() if line.startswith("note: ")]
+    assert code == 0
+    assert told[0].startswith("note: artery.pressure_kPa = 100 is far from")
+    assert told[1:] == ["note: J is far from 1"]
+    assert err.index(told[0]) < err.index("load-free:") < err.index(told[1])
+    assert call(capsys, *command, "--quiet")[2] == ""
 
 
 def test_run_writes_beside_us_and_says_what_to_open(engine, capsys, tmp_path):
