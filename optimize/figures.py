@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
 import jax
@@ -16,11 +17,11 @@ from jaxclamp import Jaw, Measure, Result
 from jaxclamp.pictures.fields import LayerFields, contact_along, layer_fields
 from jaxclamp.pictures.plots import Plate
 from jaxclamp.pictures.plots.maps import (
-    FIELD,
     frame_of_map,
     half_length_shown,
     highest_through,
     load_free_angles,
+    stress_range,
     unrolled,
 )
 from jaxclamp.pictures.plots.style import (
@@ -30,9 +31,9 @@ from jaxclamp.pictures.plots.style import (
     THIRD,
     Picture,
     colour_bar,
+    colours,
     dress,
     legend,
-    nice_limits,
     plain,
     stress_colours,
 )
@@ -131,7 +132,10 @@ def plot_difference(study: Study) -> Picture:
         np.subtract(*[_on_a_grid(layers[row], load_free_angles(r, row), reach) for r, layers in pair])
         for row in range(rows)
     ]
-    size = nice_limits([np.abs(found) for found in maps], 5.0)[1]
+    flat = [found.ravel() for found in maps]
+    shades = colours(flat, [np.ones_like(found) for found in flat], 5.0)
+    size = max(map(abs, shades.limits))
+    shades = dataclasses.replace(shades, limits=(-size, size))
     figure = Picture(5.6, 2.7 * rows + 0.3)
     grid = figure.subplots(rows, 1, squeeze=False, sharex=True)
     for row, found in enumerate(maps):
@@ -141,7 +145,7 @@ def plot_difference(study: Study) -> Picture:
             np.linspace(0.0, 180.0, ANGLES),
             found.T,
             cmap="RdBu_r",
-            norm=Normalize(-size, size),
+            norm=Normalize(*shades.limits),
             shading="gouraud",
             rasterized=True,
         )
@@ -155,7 +159,8 @@ def plot_difference(study: Study) -> Picture:
             f"{name}: best less {study.compared.other}",
             grid=False,
         )
-    colour_bar(figure, drawn, "difference of axial Cauchy stress (kPa)")
+    label = f"difference of axial Cauchy stress (kPa){shades.said('area')}"
+    colour_bar(figure, drawn, label, shades.beyond)
     return figure
 
 
@@ -164,12 +169,8 @@ def plot_stress(study: Study) -> Picture:
     results = shown(study)
     layers = {name: layer_fields(r.model, r.states[-1].state) for name, r in results.items()}
     reach = min(half_length_shown(r, layers[name]) for name, r in results.items())
-    values = [
-        layer.point_data[FIELD][np.abs(layer.points[:, 2]) <= reach]
-        for parts in layers.values()
-        for layer in parts
-    ]
-    scale = ScalarMappable(Normalize(*nice_limits(values, 5.0)), stress_colours())
+    shades = stress_range([layer for parts in layers.values() for layer in parts], reach)
+    scale = ScalarMappable(Normalize(*shades.limits), stress_colours())
     rows = len(next(iter(layers.values())))
     figure = Picture(3.4 * len(results) + 0.8, 2.7 * rows + 0.3)
     grid = figure.subplots(rows, len(results), squeeze=False, sharex=True, sharey=True)
@@ -185,7 +186,7 @@ def plot_stress(study: Study) -> Picture:
                 f"{name}: {plain(layer.name)}",
                 grid=False,
             )
-    colour_bar(figure, scale, "axial Cauchy stress (kPa)")
+    colour_bar(figure, scale, f"axial Cauchy stress (kPa){shades.said('volume')}", shades.beyond)
     return figure
 
 
@@ -248,7 +249,8 @@ PLATES = (
         "stress",
         "Axial stress at the stop",
         "Each layer unrolled, with the highest axial Cauchy stress through its thickness, on one colour "
-        "scale; crosses mark the highest of all.",
+        "scale; crosses mark the highest of all. Arrows on the bar: a small part of a layer has stresses "
+        "beyond the colours.",
         plot_stress,
     ),
     (

@@ -65,7 +65,9 @@ PLATES = (
         "axial_stress_maps",
         "Axial stress in the layers",
         "Axial Cauchy stress in the last state: each layer unrolled, with the highest value through "
-        "its thickness (left; a cross marks the highest of all), and as it lies under the jaw (right).",
+        "its thickness (left; a cross marks the highest of all), and as it lies under the jaw (right). "
+        "Arrows on the bar of colours: a small part of a layer, mostly where the mesh is too coarse for a "
+        "fold, has stresses beyond them.",
         plot_axial_stress_maps,
     ),
     (
