@@ -24,6 +24,7 @@ from jaxclamp.pictures.plots.maps import (
     stress_range,
     unrolled,
 )
+from jaxclamp.pictures.plots.states import path_of
 from jaxclamp.pictures.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
@@ -221,17 +222,23 @@ def plot_force_travel(study: Study) -> Picture:
     """Force on one jaw against its travel."""
     figure = Picture(5.6, 3.5)
     axes = figure.add_subplot()
+    travel, force = "jaw_travel_mm", "clamp_force_N"
     for name, result in shown(study).items():
-        history = result.history
+        path = path_of(result)
         axes.plot(
-            [record["jaw_travel_mm"] for record in history],
-            [record["clamp_force_N"] for record in history],
+            [record[travel] for record in path.history],
+            [record[force] for record in path.history],
             color=COLOURS[name],
             marker="o",
             markersize=3.5,
             linewidth=1.8,
-            label=name,
+            label=name if path is result else f"{name}, closing on {path.scene.mesh.words} elements",
         )
+        if path is not result:
+            axes.plot(result.final[travel], result.final[force], "D", color=COLOURS[name], markersize=6)
+    if any(result.coarser is not None for result in shown(study).values()):
+        stop = f"at the stop, {study.best.scene.mesh.words} elements"
+        axes.plot([], [], "D", color=FAINT, markersize=6, label=stop)
     dress(axes, "travel of each jaw (mm)", "force on one jaw (N)")
     axes.set_ylim(bottom=0.0)
     legend(axes)
@@ -273,7 +280,13 @@ PLATES = (
         "The objective of every design that was solved. Far outliers of the line search are cut off.",
         plot_convergence,
     ),
-    ("force_travel", "Force", "Force on one jaw against the travel of each jaw.", plot_force_travel),
+    (
+        "force_travel",
+        "Force",
+        "Force on one jaw against the travel of each jaw. Where jaws close on a coarser mesh, the curve "
+        "is that mesh's alone, and the mark beside its end is of the study's.",
+        plot_force_travel,
+    ),
 )
 
 

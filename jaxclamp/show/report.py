@@ -146,7 +146,14 @@ def _opening(title: str, content: dict[str, Any], result: Result) -> str:
     model = content["model"]
     lines = [f"<h1>{escape(title)}</h1>"]
     counts = f"{model['elements']:,} elements ({model['element']}), {model['unknowns']:,} unknowns"
-    lines.append(f'<p class="faint">{escape(counts)}, {len(result.states)} converged states</p>')
+    counts += f", {len(result.states)} converged states"
+    own = result.scene.mesh.words
+    if coarser := sorted({record["mesh"] for record in content["history"]} - {own}):
+        counts += (
+            f"; the closing path was walked on {' and '.join(coarser)} elements, "
+            f"the states in the body and at the stop are of {own}"
+        )
+    lines.append(f'<p class="faint">{escape(counts)}</p>')
     if not content["converged"]:
         reason = content["failure"] or "the stop was not reached"
         lines.append(

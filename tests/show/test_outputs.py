@@ -300,6 +300,7 @@ def pressed(symmetry: str, element: str = "q1p0"):
         closing=(load_free, last),
         history=[{"jaw_travel_mm": travel, "occlusion": 0.5 * travel} for travel in (0.0, 1.0)],
         converged=True,
+        coarser=None,
     )
 
 

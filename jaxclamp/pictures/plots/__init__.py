@@ -38,6 +38,10 @@ class Plate:
     figure: Picture
 
 
+STEP = (
+    "Where the closing path was walked on a coarser mesh, the curve is that mesh's alone, and filled "
+    "marks beside it are of the scene's own: the step between them is what the mesh changes."
+)
 PLATES = (
     (
         "wall_stress",
@@ -58,7 +62,7 @@ PLATES = (
         "stress_at_P",
         "Stress at P",
         "Axial and circumferential stress at P, the inner surface under the middle of the jaw, over "
-        "their values in the body; letters mark the sections shown.",
+        f"their values in the body; letters mark the sections shown. {STEP}",
         plot_stress_at_P,
     ),
     (
@@ -74,7 +78,7 @@ PLATES = (
         "force_travel",
         "Force and occlusion",
         "Force on one jaw, and occlusion of the lumen by height and by area, against the travel of "
-        "each jaw from first contact.",
+        f"each jaw from first contact. {STEP}",
         plot_force_travel,
     ),
 )
