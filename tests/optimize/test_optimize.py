@@ -20,7 +20,7 @@ import pytest
 import jaxclamp as jc
 from jaxclamp.cli import main
 from jaxclamp.core.failures import NotConverged
-from optimize import Constraint, DesignProblem, Variable, minimise
+from optimize import Constraint, DesignProblem, Variable, minimise, starts
 from optimize.drivers import METHODS, Enough, Target
 from optimize.evaluator import evaluate, gradients
 from optimize.journal import Journal, write_whole
@@ -269,6 +269,22 @@ def test_other_starts_are_possible_and_reproducible():
     assert len({design.tobytes() for design in first}) == 3
     lower, upper = problem.bounds
     assert all(np.all(lower <= d) and np.all(d <= upper) for d in first)
+
+
+def test_starts_that_do_not_fit_are_refused_before_anything_is_solved(monkeypatch):
+    """As many processes as there are cores, and this one."""
+    asked: list[int] = []
+
+    def refuse(scene, processes):
+        asked.append(processes)
+        raise jc.TooLittleMemory("too little")
+
+    monkeypatch.setattr(starts, "require_memory_for", refuse)
+    monkeypatch.setattr(starts, "cores", lambda: 2)
+    for count in (1, 2, 8):
+        with pytest.raises(jc.TooLittleMemory):
+            minimise(one_slope(), starts=count)
+    assert asked == [1, 2, 3]
 
 
 @pytest.mark.slow
