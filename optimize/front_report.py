@@ -7,13 +7,16 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxclamp import Progress, dump_scene
 from jaxclamp.pictures.plots import Plate, png
-from jaxclamp.pictures.plots.style import AXIAL, CIRCUMFERENTIAL, FAINT, Picture, dress, legend
+from jaxclamp.pictures.plots.style import AXIAL, FAINT, Picture, dress, legend
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
-from optimize.figures import labelled, profile
-from optimize.front import Front
+from optimize.figures import COLOURS, labelled, profile
+from optimize.front import BEATEN, WITHIN, Front
+from optimize.gains import with_error
 from optimize.journal import write_bytes, write_whole
 
 
@@ -38,9 +41,10 @@ def write_front(
 def plates_of(found: Front) -> list[Plate]:
     """The front, and the jaws on it."""
     front_said = (
-        "Each point is the best design found in the first objective for its limit on the second. Hollow ones "
-        "are beaten by another clamp in both. The start and the reference need not meet the study's "
-        "constraints."
+        "Each point is the best design found in the first objective for its limit on the second, with bars "
+        "for the numerical errors of both. Hollow points are beaten by another clamp in both; half-filled "
+        "ones by no more than the error of the difference, which is mostly far smaller than the bars. The "
+        "start and the reference need not meet the study's constraints."
     )
     jaws_said = "Faces of the jaws along the artery, from the least first objective to the least second one."
     return [
@@ -49,24 +53,40 @@ def plates_of(found: Front) -> list[Plate]:
     ]
 
 
+FILLS = {"": "full", BEATEN: "none", WITHIN: "left"}
+"""of marks, by where a point stands"""
+
+
 def plot_front(found: Front) -> Picture:
     """The second objective against the first, of every point, of the start and of the reference."""
     figure = Picture(6.4, 4.2)
     axes = figure.add_subplot()
-    on = [p for p in found.points if not found.is_beaten(p)]
-    axes.plot([p.values[0] for p in on], [p.values[1] for p in on], "-", color=AXIAL, linewidth=1.4)
-    for point in found.points:
-        face = "white" if found.is_beaten(point) else AXIAL
-        axes.plot(*point.values, "o", color=AXIAL, markerfacecolor=face, markersize=6)
-        axes.annotate(
-            point.folder, point.values, (6, 4), textcoords="offset points", fontsize=8.0, color=FAINT
+    on = [[e.value for e in found.values(p.folder)] for p in found.points if not found.standing(p.folder)]
+    axes.plot(*np.transpose(on), "-", color=AXIAL, linewidth=1.4)
+    for name in found.estimates:
+        x, y = found.values(name)
+        beside = name in found.others
+        axes.errorbar(
+            x.value,
+            y.value,
+            xerr=x.error,
+            yerr=y.error,
+            fmt="s" if beside else "o",
+            color=COLOURS[name] if beside else AXIAL,
+            fillstyle="full" if beside else FILLS[found.standing(name)],
+            markersize=6,
+            elinewidth=0.8,
+            capsize=2.0,
+            label=name if beside else None,
         )
-    for name, values in found.others.items():
-        colour = FAINT if name == "reference" else CIRCUMFERENTIAL
-        axes.plot(*values, "s", color=colour, markersize=6, label=name)
-    x, y = map(labelled, found.objectives)
-    dress(axes, x, y)
-    legend(axes)
+        if not beside:
+            axes.annotate(
+                name, (x.value, y.value), (6, 4), textcoords="offset points", fontsize=8.0, color=FAINT
+            )
+    first, second = map(labelled, found.objectives)
+    dress(axes, first, second)
+    if found.others:
+        legend(axes)
     return figure
 
 
@@ -81,21 +101,27 @@ def plot_jaws(found: Front) -> Picture:
     return figure
 
 
+def _values(found: Front, name: str) -> list[str]:
+    """Both objectives of a clamp with their errors."""
+    return [with_error(e.value, e.error, "") for e in found.values(name)]
+
+
 def page(found: Front, title: str, plates: list[tuple[Plate, bytes]]) -> str:
     """The page of a front."""
     first, second = map(labelled, found.objectives)
     rows = [
         [
             p.folder,
-            *map(number, p.values),
+            *_values(found, p.folder),
             number(p.limit),
             f"{p.violation:.1%}",
+            found.standing(p.folder),
             f"{p.evaluations} designs, {p.stopped_because}",
         ]
         for p in found.points
     ]
-    rows += [[name, *map(number, values), "–", "–", ""] for name, values in found.others.items()]
-    head = ["", first, second, "limit on the second", "constraints violated by", "search"]
+    rows += [[name, *_values(found, name), "–", "–", found.standing(name), ""] for name in found.others]
+    head = ["", first, second, "limit on the second", "constraints violated by", "", "search"]
     design = table(
         ["variable", *(p.folder for p in found.points)],
         [
