@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxclamp import Progress, dump_scene
 from jaxclamp.pictures.plots import Plate, png
-from jaxclamp.pictures.plots.style import AXIAL, FAINT, Picture, dress, legend
+from jaxclamp.pictures.plots.style import AXIAL, FAINT, INK, NORMAL, Picture, dress, legend
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
 from optimize.figures import COLOURS, labelled, profile
@@ -46,7 +46,7 @@ def plates_of(found: Front) -> list[Plate]:
         "ones by no more than the error of the difference, which is mostly far smaller than the bars. The "
         "start and the reference need not meet the study's constraints."
     )
-    jaws_said = "Faces of the jaws along the artery, from the least first objective to the least second one."
+    jaws_said = "Faces of the jaws, to scale, from the least first objective to the least second one."
     return [
         Plate("front", "What they cost each other", front_said, plot_front(found)),
         Plate("profiles", "The jaws", jaws_said, plot_jaws(found)),
@@ -91,13 +91,14 @@ def plot_front(found: Front) -> Picture:
 
 
 def plot_jaws(found: Front) -> Picture:
-    """The faces of all jaws on the front, one above the other."""
+    """The faces of all jaws on the front, one above the other, all to one scale."""
     figure = Picture(7.2, 1.3 * len(found.points) + 0.6)
-    for place, point in enumerate(found.points, 1):
-        axes = figure.add_subplot(len(found.points), 1, place)
+    panels = figure.subplots(len(found.points), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    for axes, point in zip(panels, found.points, strict=True):
         axes.plot(*profile(point.result), color=AXIAL, linewidth=1.6)
-        last = place == len(found.points)
-        dress(axes, "position along the artery (mm)" if last else "", "height (mm)", point.folder)
+        axes.set_aspect("equal")
+        dress(axes, "", "height (mm)", point.folder)
+    panels[-1].set_xlabel("position along the artery (mm)", fontsize=NORMAL, color=INK)
     return figure
 
 

@@ -47,7 +47,7 @@ table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nu
 th, td { text-align: left; padding: .3rem .8rem .3rem 0; border-bottom: 1px solid var(--rule);
   vertical-align: top; }
 th { font-weight: 600; color: var(--faint); }
-td.number, th.number { text-align: right; white-space: nowrap; padding-right: 1.4rem; }
+td.number, th.number { text-align: right; padding-right: 1.4rem; } td.number { white-space: nowrap; }
 .scroll + .scroll { margin-top: 1.4rem; }
 .good, .look { color: var(--good); font-weight: 600; white-space: nowrap; } .look { color: var(--look); }
 figure { margin: 1.4rem 0; break-inside: avoid; }

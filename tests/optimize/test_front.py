@@ -131,7 +131,6 @@ def test_a_front_is_swept_resumed_and_drawn(tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found == json.loads((out / "study.json").read_text())
     first, second = np.array([p["objectives"] for p in found["front"]]).T
-    assert all(0.0 < error < 20.0 for p in found["front"] for error in p["errors"])
     assert [p["folder"] for p in found["front"]] == ["point-1", "point-2", "point-3"]
     assert first[0] == pytest.approx(min(first), rel=1e-6)
     assert second[-1] == pytest.approx(min(second), rel=1e-6)
@@ -146,6 +145,8 @@ def test_a_front_is_swept_resumed_and_drawn(tmp_path, capsys):
     best = jc.clamp(jc.load_scene(out / "point-3" / "best" / "scene.toml"))
     assert best.measure(PRESSURE) == pytest.approx(second[-1], rel=1e-5)
     assert best.measure(PEAK) == pytest.approx(first[-1], rel=1e-5)
+    near = jc.neighbours(best).estimates((PEAK, PRESSURE))
+    assert found["front"][-1]["errors"] == pytest.approx([near[m].error for m in (PEAK, PRESSURE)], rel=1e-2)
 
     # a second study there needs --resume; one that was cut off goes on with what it has
     assert main(command) == 2
