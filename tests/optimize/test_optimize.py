@@ -20,11 +20,12 @@ import pytest
 import jaxclamp as jc
 from jaxclamp.cli import main
 from jaxclamp.core.failures import NotConverged
-from optimize import Constraint, DesignProblem, Variable, minimise, starts
+from optimize import Constraint, DesignProblem, Variable, evaluator, minimise, starts
 from optimize.drivers import METHODS, Enough, Target
 from optimize.evaluator import evaluate, gradients
 from optimize.journal import Journal, write_whole
 from optimize.named_measures import named
+from optimize.record import Record
 from optimize.starts import other_starts
 from optimize.study_file import load_study
 from optimize.variables import entries, with_design
@@ -260,6 +261,17 @@ def test_a_state_that_a_cold_solution_does_not_find_is_no_design(monkeypatch):
     assert lied
     assert not any(e.design is study.best_design for e in lied)
     assert all("from scratch" in e.failure for e in lied)
+
+
+def test_the_first_design_is_told_before_it_is_solved(monkeypatch):
+    def stop(problem, design, near):
+        raise NotImplementedError
+
+    told: list[jc.Progress] = []
+    monkeypatch.setattr(evaluator, "evaluate", stop)
+    with pytest.raises(NotImplementedError):
+        evaluator.Evaluator(Record(one_slope(), "slsqp", []), None, 4, told.append).at(np.array([0.5]))
+    assert [(event.fraction, event.message) for event in told] == [(0.0, "design 1, with compilation")]
 
 
 def test_other_starts_are_possible_and_reproducible():
