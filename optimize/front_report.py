@@ -117,12 +117,13 @@ def page(found: Front, title: str, plates: list[tuple[Plate, bytes]]) -> str:
             number(p.limit),
             f"{p.violation:.1%}",
             found.standing(p.folder),
-            f"{p.evaluations} designs, {p.stopped_because}",
+            str(p.evaluations),
         ]
         for p in found.points
     ]
     rows += [[name, *_values(found, name), "–", "–", found.standing(name), ""] for name in found.others]
-    head = ["", first, second, "limit on the second", "constraints violated by", "", "search"]
+    head = ["", first, second, "limit on the second", "constraints violated by", "", "designs"]
+    searches = "; ".join(f"{p.folder}: {p.stopped_because}" for p in found.points)
     design = table(
         ["variable", *(p.folder for p in found.points)],
         [
@@ -139,7 +140,7 @@ def page(found: Front, title: str, plates: list[tuple[Plate, bytes]]) -> str:
         [
             said + notice,
             figure_section(plates),
-            section("Points", table(head, rows)),
+            section("Points", f'{table(head, rows)}<p class="faint">Searches: {escape(searches)}.</p>'),
             section("Designs", design),
         ],
     )

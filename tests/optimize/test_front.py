@@ -13,7 +13,7 @@ import pytest
 import jaxclamp as jc
 from jaxclamp.cli import main
 from optimize.front import BEATEN, WITHIN, Front, Point
-from optimize.front_report import plot_front
+from optimize.front_report import page, plot_front
 from optimize.study_file import load_study
 
 STUDY = """
@@ -118,6 +118,8 @@ def test_a_point_that_is_beaten_within_its_error_is_said_so(tmp_path, errors, wo
     assert told["errors"] == [pytest.approx(errors["point-3"]), 0.0]
     assert found.rows()[2][f"error of {PEAK}"] == pytest.approx(errors["point-3"])
     assert any(line.endswith(word) and "2.5 ± " in line for line in found.lines())
+    assert f"2.5 ± {errors['point-3']:g}" in (text := page(found, "Front", []))
+    assert ("within its error" in text) == (word == WITHIN)
     bars = [c for c in plot_front(found).axes[0].containers if c.has_xerr]
     ends = [bar.lines[2][0].get_segments()[0][:, 0] for bar in bars]
     assert any(np.ptp(end) == pytest.approx(2.0 * errors["point-3"]) for end in ends)
