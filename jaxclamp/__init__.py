@@ -60,6 +60,7 @@ from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
 from jaxclamp.solve.clamping import Result, clamp  # noqa: E402
 from jaxclamp.solve.linear_solvers import cores  # noqa: E402
 from jaxclamp.solve.loading import load_result  # noqa: E402
+from jaxclamp.solve.memory import require_memory_for  # noqa: E402
 from jaxclamp.solve.results import versions  # noqa: E402
 from jaxclamp.trust.estimates import Estimate, Neighbours, neighbours, with_errors  # noqa: E402
 
@@ -116,6 +117,7 @@ __all__ = [
     "quantity",
     "record",
     "replace",
+    "require_memory_for",
     "require_possible",
     "shown_in",
     "smooth_maximum",

@@ -162,6 +162,9 @@ class Evaluator:
 
     def _solve(self, design: np.ndarray) -> Evaluation:
         """Evaluate a new design and write it down."""
+        if not self.solved:
+            done = len(self.record.evaluations)
+            self.tell(Progress("optimising", done / self.most, f"design {done + 1}, with compilation"))
         distance = lambda kept: float(np.max(np.abs(kept[0] - design) / self.width))  # noqa: E731
         # a tie, or nearly one, goes to the result solved last: the factors at hand are its own
         nearest = min(reversed(self.near), key=distance, default=None)

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from jaxclamp import Measure, Result
+from jaxclamp import Jaw, Measure, Result
 from jaxclamp.pictures.fields import LayerFields, contact_along, layer_fields
 from jaxclamp.pictures.plots import Plate
 from jaxclamp.pictures.plots.maps import (
-    FIELD,
     frame_of_map,
     half_length_shown,
     highest_through,
     load_free_angles,
+    stress_range,
     unrolled,
 )
+from jaxclamp.pictures.plots.states import path_of
 from jaxclamp.pictures.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
@@ -28,9 +32,9 @@ from jaxclamp.pictures.plots.style import (
     THIRD,
     Picture,
     colour_bar,
+    colours,
     dress,
     legend,
-    nice_limits,
     plain,
     stress_colours,
 )
@@ -53,34 +57,39 @@ def labelled(measure: Measure) -> str:
     return f"{words[:1].upper()}{words[1:]}{f', {measure.unit}' if measure.unit else ''}"
 
 
+CLIMBS = 1000
+"""steps to a face from below: on a slope of 20 each leaves 0.95 of the way"""
+
+
 def profile(result: Result) -> tuple[np.ndarray, np.ndarray]:
-    """The jaw's face along the artery: z and height above its lowest point, mm, from the gap itself."""
+    """The jaw's face along the artery, side to side: z and height above its lowest point, mm.
+
+    A height that no part of the face has is not a number. z is closer together towards the sides, where
+    faces rise steeply.
+    """
     jaw = result.scene.clamp.jaw
     reach = float(jaw.half_extent())
-    z = np.linspace(-1.02 * reach, 1.02 * reach, 401)
-    height = np.linspace(-0.2, 2.0 * reach, 801)
-    along, up = np.meshgrid(z, height, indexing="ij")
-    inside = np.asarray(jaw.gap(jnp.stack([0.0 * along, up, along])))
-    first = np.argmax(inside < 0.0, axis=1)
-    found = np.any(inside < 0.0, axis=1) & (first > 0)
-    before, after = (np.take_along_axis(inside, (first - k)[:, None], 1)[:, 0] for k in (1, 0))
-    share = before / np.where(before == after, 1.0, before - after)
-    y = height[first - 1] + share * (height[1] - height[0])
-    return z, np.where(found, y, np.nan)
+    z = reach * np.sin(np.linspace(-0.5 * np.pi, 0.5 * np.pi, 401))
+    y, gap = map(np.asarray, _climbed(jaw, jnp.asarray(z), jnp.full(z.shape, -reach)))
+    return z, np.where(np.abs(gap) < 1e-4 * reach, y, np.nan)
+
+
+@jax.jit
+def _climbed(jaw: Jaw, z: Array, y: Array) -> tuple[Array, Array]:
+    """Heights from y (n,) on, raised again and again by the gap that is left at z; and what is left then."""
+    gap = lambda up: jaw.gap((jnp.zeros_like(z), up, z))  # noqa: E731
+    up = jax.lax.fori_loop(0, CLIMBS, lambda _, up: up + gap(up), y)
+    return up, gap(up)
 
 
 def plot_profiles(study: Study) -> Picture:
-    """The faces of the jaws along the artery, to scale."""
+    """The faces of the jaws along the artery, to scale, each from side to side and to its top."""
     figure = Picture(7.2, 3.0)
     axes = figure.add_subplot()
-    highest = 0.0
     for name, result in shown(study).items():
-        z, y = profile(result)
-        highest = max(highest, float(np.nanmax(y)))
-        axes.plot(z, y, color=COLOURS[name], linewidth=2.2 if name == "best" else 1.4, label=name)
+        axes.plot(*profile(result), color=COLOURS[name], linewidth=2.2 if name == "best" else 1.4, label=name)
     dress(axes, "position along the artery (mm)", "height (mm)", "Face of the upper jaw, to scale")
     axes.set_aspect("equal")
-    axes.set_ylim(-0.05 * highest, 1.05 * highest)
     legend(axes, loc="upper center", ncols=3)
     return figure
 
@@ -124,7 +133,10 @@ def plot_difference(study: Study) -> Picture:
         np.subtract(*[_on_a_grid(layers[row], load_free_angles(r, row), reach) for r, layers in pair])
         for row in range(rows)
     ]
-    size = nice_limits([np.abs(found) for found in maps], 5.0)[1]
+    flat = [found.ravel() for found in maps]
+    shades = colours(flat, [np.ones_like(found) for found in flat], 5.0)
+    size = max(map(abs, shades.limits))
+    shades = dataclasses.replace(shades, limits=(-size, size))
     figure = Picture(5.6, 2.7 * rows + 0.3)
     grid = figure.subplots(rows, 1, squeeze=False, sharex=True)
     for row, found in enumerate(maps):
@@ -134,7 +146,7 @@ def plot_difference(study: Study) -> Picture:
             np.linspace(0.0, 180.0, ANGLES),
             found.T,
             cmap="RdBu_r",
-            norm=Normalize(-size, size),
+            norm=Normalize(*shades.limits),
             shading="gouraud",
             rasterized=True,
         )
@@ -148,7 +160,8 @@ def plot_difference(study: Study) -> Picture:
             f"{name}: best less {study.compared.other}",
             grid=False,
         )
-    colour_bar(figure, drawn, "difference of axial Cauchy stress (kPa)")
+    label = f"difference of axial Cauchy stress (kPa){shades.said('area')}"
+    colour_bar(figure, drawn, label, shades.beyond)
     return figure
 
 
@@ -157,12 +170,8 @@ def plot_stress(study: Study) -> Picture:
     results = shown(study)
     layers = {name: layer_fields(r.model, r.states[-1].state) for name, r in results.items()}
     reach = min(half_length_shown(r, layers[name]) for name, r in results.items())
-    values = [
-        layer.point_data[FIELD][np.abs(layer.points[:, 2]) <= reach]
-        for parts in layers.values()
-        for layer in parts
-    ]
-    scale = ScalarMappable(Normalize(*nice_limits(values, 5.0)), stress_colours())
+    shades = stress_range([layer for parts in layers.values() for layer in parts], reach)
+    scale = ScalarMappable(Normalize(*shades.limits), stress_colours())
     rows = len(next(iter(layers.values())))
     figure = Picture(3.4 * len(results) + 0.8, 2.7 * rows + 0.3)
     grid = figure.subplots(rows, len(results), squeeze=False, sharex=True, sharey=True)
@@ -178,7 +187,7 @@ def plot_stress(study: Study) -> Picture:
                 f"{name}: {plain(layer.name)}",
                 grid=False,
             )
-    colour_bar(figure, scale, "axial Cauchy stress (kPa)")
+    colour_bar(figure, scale, f"axial Cauchy stress (kPa){shades.said('volume')}", shades.beyond)
     return figure
 
 
@@ -213,17 +222,23 @@ def plot_force_travel(study: Study) -> Picture:
     """Force on one jaw against its travel."""
     figure = Picture(5.6, 3.5)
     axes = figure.add_subplot()
+    travel, force = "jaw_travel_mm", "clamp_force_N"
     for name, result in shown(study).items():
-        history = result.history
+        path = path_of(result)
         axes.plot(
-            [record["jaw_travel_mm"] for record in history],
-            [record["clamp_force_N"] for record in history],
+            [record[travel] for record in path.history],
+            [record[force] for record in path.history],
             color=COLOURS[name],
             marker="o",
             markersize=3.5,
             linewidth=1.8,
-            label=name,
+            label=name if path is result else f"{name}, closing on {path.scene.mesh.words} elements",
         )
+        if path is not result:
+            axes.plot(result.final[travel], result.final[force], "D", color=COLOURS[name], markersize=6)
+    if any(result.coarser is not None for result in shown(study).values()):
+        stop = f"at the stop, {study.best.scene.mesh.words} elements"
+        axes.plot([], [], "D", color=FAINT, markersize=6, label=stop)
     dress(axes, "travel of each jaw (mm)", "force on one jaw (N)")
     axes.set_ylim(bottom=0.0)
     legend(axes)
@@ -241,7 +256,8 @@ PLATES = (
         "stress",
         "Axial stress at the stop",
         "Each layer unrolled, with the highest axial Cauchy stress through its thickness, on one colour "
-        "scale; crosses mark the highest of all.",
+        "scale; crosses mark the highest of all. Arrows on the bar: a small part of a layer has stresses "
+        "beyond the colours.",
         plot_stress,
     ),
     (
@@ -264,7 +280,13 @@ PLATES = (
         "The objective of every design that was solved. Far outliers of the line search are cut off.",
         plot_convergence,
     ),
-    ("force_travel", "Force", "Force on one jaw against the travel of each jaw.", plot_force_travel),
+    (
+        "force_travel",
+        "Force",
+        "Force on one jaw against the travel of each jaw. Where jaws close on a coarser mesh, the curve "
+        "is that mesh's alone, and the mark beside its end is of the study's.",
+        plot_force_travel,
+    ),
 )
 
 

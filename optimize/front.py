@@ -16,15 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp import EquilibriumError, Measure, Progress, Result, SceneError, clamp, versions
+from jaxclamp import EquilibriumError, Estimate, Measure, Progress, Result, SceneError, clamp, versions
 from jaxclamp.core.parts import own_parts
+from optimize.gains import with_error
 from optimize.journal import Journal
 from optimize.named_measures import in_words
 from optimize.problem import Constraint, DesignProblem
 from optimize.record import FEASIBLE, Evaluation, Record
 from optimize.resuming import take_over
 from optimize.starts import Budget, drive
-from optimize.study import found_cold, require_solvable, with_bounds
+from optimize.study import compare, found_cold, require_solvable, with_bounds
+
+BEATEN, WITHIN = "beaten", "beaten within its error"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +40,6 @@ class Point:
     """on the second objective, internal units; None at an end"""
     design: np.ndarray
     """(n_variables,), internal units"""
-    values: tuple[float, float]
-    """both objectives"""
     violation: float
     """of the constraints, relative"""
     result: Result
@@ -59,8 +60,8 @@ class Front:
     """the other objective"""
     points: tuple[Point, ...]
     """from the least first objective to the least second one"""
-    others: dict[str, tuple[float, float]]
-    """both objectives of the start and of the reference"""
+    estimates: dict[str, dict[Measure, Estimate]]
+    """both objectives with their errors: of each point by its folder, of the start, of the reference"""
     seconds: float
     """wall time"""
 
@@ -69,12 +70,24 @@ class Front:
         """Both."""
         return self.problem.objective, self.second
 
+    def values(self, name: str) -> tuple[Estimate, Estimate]:
+        """Both objectives of a point (by its folder), of the start or of the reference."""
+        first, second = (self.estimates[name][m] for m in self.objectives)
+        return first, second
+
+    @property
+    def others(self) -> list[str]:
+        """The clamps beside the points: start and reference, as far as they have an equilibrium."""
+        return [name for name in self.estimates if name in ("start", "reference")]
+
     def lines(self) -> list[str]:
         """What came of it, for a terminal."""
         first, second = (f"{in_words(m)} ({m.unit})" for m in self.objectives)
         said = [f"  {first}, {second}"]
-        rows = {point.folder: point.values for point in self.points} | self.others
-        return said + [f"    {name:<12}{a:>10.4g}{b:>10.4g}" for name, (a, b) in rows.items()]
+        for name in self.estimates:
+            a, b = (with_error(e.value, e.error, "") for e in self.values(name))
+            said.append(f"    {name:<12}{a:<18}{b:<18}{self.standing(name)}".rstrip())
+        return said
 
     @property
     def warning(self) -> str | None:
@@ -82,21 +95,35 @@ class Front:
         bad = [point.folder for point in self.points if point.violation > FEASIBLE]
         return f"no design met the constraints of {', '.join(bad)}" if bad else None
 
-    def is_beaten(self, point: Point) -> bool:
-        """True if another clamp (or start, reference) is better in one objective, no worse in the other."""
-        a = np.array(point.values)
-        others = [*(p.values for p in self.points), *self.others.values()]
-        return any(np.all(values <= a) and np.any(values < a) for values in map(np.array, others))
+    def standing(self, name: str) -> str:
+        """`BEATEN` if another clamp is better in one objective and no worse in the other; blank if none is.
+
+        `WITHIN` if each clamp that beats it does so by no more than the error of the difference.
+        """
+        leads = [
+            [own - its for own, its in zip(self.values(name), self.values(other), strict=True)]
+            for other in self.estimates
+        ]
+        beating = [lead for lead in leads if min(d.value for d in lead) >= 0.0 < max(d.value for d in lead)]
+        if not beating:
+            return ""
+        return BEATEN if any(d.value > (d.error or 0.0) for lead in beating for d in lead) else WITHIN
 
     def rows(self) -> list[dict[str, Any]]:
         """The rows of iterations.csv: one for each point, file units for the design."""
         names = [str(m) for m in self.objectives]
         entries = self.problem.entries
         return [
-            {"point": p.folder, **dict(zip(names, p.values, strict=True))}
+            {"point": p.folder, **dict(zip(names, self._numbers(p.folder)["objectives"], strict=True))}
+            | {f"error of {n}": e for n, e in zip(names, self._numbers(p.folder)["errors"], strict=True)}
             | {e.name: v / e.factor for e, v in zip(entries, p.design, strict=True)}
             for p in self.points
         ]
+
+    def _numbers(self, name: str) -> dict[str, list[float | None]]:
+        """Values and errors of both objectives, as in study.json."""
+        found = self.values(name)
+        return {"objectives": [e.value for e in found], "errors": [e.error for e in found]}
 
     def to_dict(self) -> dict[str, Any]:
         """The content of study.json."""
@@ -112,17 +139,18 @@ class Front:
                 {
                     "folder": p.folder,
                     "limit": p.limit,
-                    "objectives": list(p.values),
+                    **self._numbers(p.folder),
                     "design": (p.design / factors).tolist(),
                     "violation": p.violation,
-                    "beaten": self.is_beaten(p),
+                    "beaten": self.standing(p.folder) != "",
+                    "beaten_within_error": self.standing(p.folder) == WITHIN,
                     "evaluations": p.evaluations,
                     "stopped_because": p.stopped_because,
                     "final": p.result.final,
                 }
                 for p in self.points
             ],
-            **{name: {"objectives": list(values)} for name, values in self.others.items()},
+            **{name: self._numbers(name) for name in self.others},
             "cost": {"wall_s": self.seconds},
             "own_parts": own_parts(
                 self.problem.scene, self.problem.reference, self.problem.measures, self.second
@@ -157,13 +185,13 @@ def front(
         points = _Searches(bounded, second, budget, folder, resume, tell).points(count)
         if reference is None and problem.reference is not None:
             reference = _clamped(problem.reference)
-        solved = {"start": _clamped(problem.scene), "reference": reference}
-        others = {
-            name: (result.measure(problem.objective), result.measure(second))
-            for name, result in solved.items()
-            if result is not None
-        }
-        found = Front(problem, second, points, others, time.perf_counter() - begun)
+        others = {"start": _clamped(problem.scene), "reference": reference}
+        asked = {p.folder: p.result for p in points}
+        asked |= {name: result for name, result in others.items() if result is not None}
+        tell(Progress("errors", 0.0, "how far both objectives of each point may be off"))
+        results, compared = compare(problem.objective, asked, (problem.objective, second))
+        points = tuple(dataclasses.replace(p, result=results[p.folder]) for p in points)
+        found = Front(problem, second, points, compared.estimates, time.perf_counter() - begun)
         journal.write(found.to_dict(), found.rows())
         return found
     finally:
@@ -200,7 +228,8 @@ class _Searches:
     def points(self, count: int) -> tuple[Point, ...]:
         """From the least first objective to the least second one."""
         begin, end = self._point(1, None), self._point(count, None, swapped=True)
-        limits = np.linspace(begin.values[1], end.values[1], count)[1:-1].tolist()
+        first, last = (point.result.measure(self.second) for point in (begin, end))
+        limits = np.linspace(first, last, count)[1:-1].tolist()
         between = [self._point(number, limit) for number, limit in enumerate(limits, 2)]
         return (begin, *between, end)
 
@@ -228,9 +257,8 @@ class _Searches:
         self.tell(Progress(name, 1.0, stopped))
         self.known += [_swapped(e, swapped) for e in record.evaluations]
         self.solved.append((best.design, result))
-        first, second = _swapped(best, swapped).values[:2].tolist()
         violation, count = best.violation(problem), len(record.evaluations)
-        return Point(name, limit, best.design, (first, second), violation, result, count, stopped)
+        return Point(name, limit, best.design, violation, result, count, stopped)
 
 
 def _swapped(e: Evaluation, swapped: bool) -> Evaluation:

@@ -7,13 +7,16 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxclamp import Progress, dump_scene
 from jaxclamp.pictures.plots import Plate, png, svg
-from jaxclamp.pictures.plots.style import AXIAL, CIRCUMFERENTIAL, FAINT, Picture, dress, legend
+from jaxclamp.pictures.plots.style import AXIAL, FAINT, INK, NORMAL, Picture, dress, legend
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
-from optimize.figures import labelled, profile
-from optimize.front import Front
+from optimize.figures import COLOURS, labelled, profile
+from optimize.front import BEATEN, WITHIN, Front
+from optimize.gains import with_error
 from optimize.journal import write_bytes, write_whole
 
 
@@ -39,47 +42,70 @@ def write_front(
 def plates_of(found: Front) -> list[Plate]:
     """The front, and the jaws on it."""
     front_said = (
-        "Each point is the best design found in the first objective for its limit on the second. Hollow ones "
-        "are beaten by another clamp in both. The start and the reference need not meet the study's "
-        "constraints."
+        "Each point is the best design found in the first objective for its limit on the second, with bars "
+        "for the numerical errors of both. Hollow points are beaten by another clamp in both; half-filled "
+        "ones by no more than the error of the difference, which is mostly far smaller than the bars. The "
+        "start and the reference need not meet the study's constraints."
     )
-    jaws_said = "Faces of the jaws along the artery, from the least first objective to the least second one."
+    jaws_said = "Faces of the jaws, to scale, from the least first objective to the least second one."
     return [
         Plate("front", "What they cost each other", front_said, plot_front(found)),
         Plate("profiles", "The jaws", jaws_said, plot_jaws(found)),
     ]
 
 
+FILLS = {"": "full", BEATEN: "none", WITHIN: "left"}
+"""of marks, by where a point stands"""
+
+
 def plot_front(found: Front) -> Picture:
     """The second objective against the first, of every point, of the start and of the reference."""
     figure = Picture(6.4, 4.2)
     axes = figure.add_subplot()
-    on = [p for p in found.points if not found.is_beaten(p)]
-    axes.plot([p.values[0] for p in on], [p.values[1] for p in on], "-", color=AXIAL, linewidth=1.4)
-    for point in found.points:
-        face = "white" if found.is_beaten(point) else AXIAL
-        axes.plot(*point.values, "o", color=AXIAL, markerfacecolor=face, markersize=6)
-        axes.annotate(
-            point.folder, point.values, (6, 4), textcoords="offset points", fontsize=8.0, color=FAINT
+    on = [[e.value for e in found.values(p.folder)] for p in found.points if not found.standing(p.folder)]
+    axes.plot(*np.transpose(on), "-", color=AXIAL, linewidth=1.4)
+    for name in found.estimates:
+        x, y = found.values(name)
+        beside = name in found.others
+        axes.errorbar(
+            x.value,
+            y.value,
+            xerr=x.error,
+            yerr=y.error,
+            fmt="s" if beside else "o",
+            color=COLOURS[name] if beside else AXIAL,
+            fillstyle="full" if beside else FILLS[found.standing(name)],
+            markersize=6,
+            elinewidth=0.8,
+            capsize=2.0,
+            label=name if beside else None,
         )
-    for name, values in found.others.items():
-        colour = FAINT if name == "reference" else CIRCUMFERENTIAL
-        axes.plot(*values, "s", color=colour, markersize=6, label=name)
-    x, y = map(labelled, found.objectives)
-    dress(axes, x, y)
-    legend(axes)
+        if not beside:
+            axes.annotate(
+                name, (x.value, y.value), (6, 4), textcoords="offset points", fontsize=8.0, color=FAINT
+            )
+    first, second = map(labelled, found.objectives)
+    dress(axes, first, second)
+    if found.others:
+        legend(axes)
     return figure
 
 
 def plot_jaws(found: Front) -> Picture:
-    """The faces of all jaws on the front, one above the other."""
+    """The faces of all jaws on the front, one above the other, all to one scale."""
     figure = Picture(7.2, 1.3 * len(found.points) + 0.6)
-    for place, point in enumerate(found.points, 1):
-        axes = figure.add_subplot(len(found.points), 1, place)
+    panels = figure.subplots(len(found.points), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    for axes, point in zip(panels, found.points, strict=True):
         axes.plot(*profile(point.result), color=AXIAL, linewidth=1.6)
-        last = place == len(found.points)
-        dress(axes, "position along the artery (mm)" if last else "", "height (mm)", point.folder)
+        axes.set_aspect("equal")
+        dress(axes, "", "height (mm)", point.folder)
+    panels[-1].set_xlabel("position along the artery (mm)", fontsize=NORMAL, color=INK)
     return figure
+
+
+def _values(found: Front, name: str) -> list[str]:
+    """Both objectives of a clamp with their errors."""
+    return [with_error(e.value, e.error, "") for e in found.values(name)]
 
 
 def page(found: Front, title: str, plates: list[tuple[Plate, bytes]]) -> str:
@@ -88,15 +114,17 @@ def page(found: Front, title: str, plates: list[tuple[Plate, bytes]]) -> str:
     rows = [
         [
             p.folder,
-            *map(number, p.values),
+            *_values(found, p.folder),
             number(p.limit),
             f"{p.violation:.1%}",
-            f"{p.evaluations} designs, {p.stopped_because}",
+            found.standing(p.folder),
+            str(p.evaluations),
         ]
         for p in found.points
     ]
-    rows += [[name, *map(number, values), "–", "–", ""] for name, values in found.others.items()]
-    head = ["", first, second, "limit on the second", "constraints violated by", "search"]
+    rows += [[name, *_values(found, name), "–", "–", found.standing(name), ""] for name in found.others]
+    head = ["", first, second, "limit on the second", "constraints violated by", "", "designs"]
+    searches = "; ".join(f"{p.folder}: {p.stopped_because}" for p in found.points)
     design = table(
         ["variable", *(p.folder for p in found.points)],
         [
@@ -113,7 +141,7 @@ def page(found: Front, title: str, plates: list[tuple[Plate, bytes]]) -> str:
         [
             said + notice,
             figure_section(plates),
-            section("Points", table(head, rows)),
+            section("Points", f'{table(head, rows)}<p class="faint">Searches: {escape(searches)}.</p>'),
             section("Designs", design),
         ],
     )

@@ -24,6 +24,7 @@ from jaxclamp import (
     SceneError,
     WorkerLost,
     cores,
+    require_memory_for,
     require_possible,
 )
 from jaxclamp.core.parts import call, packed
@@ -100,6 +101,16 @@ def other_starts(problem: DesignProblem, count: int) -> list[np.ndarray]:
     return found[:count]
 
 
+def require_room(problem: DesignProblem, starts: int) -> None:
+    """Raise TooLittleMemory if the processes of so many starts will not fit into memory at once."""
+    require_memory_for(problem.scene, 1 + at_once(starts - 1))
+
+
+def at_once(others: int) -> int:
+    """Processes that work on so many other starts at a time."""
+    return min(others, cores())
+
+
 @contextmanager
 def elsewhere(
     problem: DesignProblem, budget: Budget, count: int, folder: Path | None, resume: bool
@@ -111,7 +122,7 @@ def elsewhere(
     if count < 1:
         yield []
         return
-    pool = ProcessPoolExecutor(min(count, cores()), mp_context=multiprocessing.get_context("spawn"))
+    pool = ProcessPoolExecutor(at_once(count), mp_context=multiprocessing.get_context("spawn"))
     try:
         yield [
             pool.submit(

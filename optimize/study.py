@@ -34,7 +34,7 @@ from optimize.price import Compared, injuries
 from optimize.problem import DesignProblem, require_consistent
 from optimize.record import FEASIBLE, Evaluation, Record
 from optimize.resuming import take_over
-from optimize.starts import Budget, answer, drive, elsewhere
+from optimize.starts import Budget, answer, drive, elsewhere, require_room
 from optimize.verification import Verification, verify
 
 COLD_AGREES = 1e-4
@@ -142,10 +142,11 @@ def minimise(
     check_finer_mesh: solve start and best on a finer mesh with stiffer and sharper contact, too
 
     Raises SceneError for a problem that makes no sense, EquilibriumError if the start has no solution,
-    OSError if the folder cannot be written.
+    TooLittleMemory if the starts that are solved at once do not fit, OSError if the folder cannot be written.
     """
     begun, tell = time.perf_counter(), progress or (lambda event: None)
     require_solvable(problem, method)
+    require_room(problem, starts)
     problem, reference = with_bounds(problem, tell)
     record = Record(problem, method, [])
     place = None if folder is None else Path(folder)

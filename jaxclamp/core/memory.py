@@ -16,14 +16,13 @@ def resident_MB() -> float | None:
     return None if size is None else size / 1024.0
 
 
-def free_MB() -> tuple[float, str] | None:
-    """Memory that this process may still take, MB, and what limits it; None where the system does not tell.
+def limits_MB() -> list[tuple[float, str]]:
+    """Memory that this process may still take, MB, and what limits it, the tightest first; [] if not known.
 
-    The least of what the machine has left, what `ulimit -v` leaves, and what the group of processes (a
-    container) may have.
+    Of the machine, of `ulimit -v`, and of the group of processes (a container).
     """
-    known = [limit for limit in (_of_machine(), _of_address_space(), *_of_groups()) if limit is not None]
-    return min(known, default=None)
+    known = (_of_machine(), _of_address_space(), *_of_groups())
+    return sorted(limit for limit in known if limit is not None)
 
 
 def _of_machine() -> tuple[float, str] | None:

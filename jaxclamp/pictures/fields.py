@@ -49,6 +49,8 @@ class LayerFields:
     """each (n,), (n, 3) for vectors, or (n, 3, 3) for tensors"""
     cell_data: dict[str, np.ndarray]
     """each (n_cells,)"""
+    volumes: np.ndarray
+    """share of each point in the volume of the stress-free wall, mm³, (n,)"""
     symmetry: Symmetry
     """the mirror planes that make the whole artery of these points; none if they are all of it"""
     grid: tuple[int, int, int] | None
@@ -104,6 +106,7 @@ def layer_fields(model: Model, state: State, start: State | None = None) -> tupl
                 cells=cells,
                 point_data=data,
                 cell_data={"layer": np.full(last - first, number + 1), "J": J},
+                volumes=_summed(cells, np.sum(dV, axis=0) / len(cells), len(nodes)),
                 symmetry=model.symmetry,
                 grid=_layer_grid(mesh, nodes),
             )
@@ -119,8 +122,12 @@ def _layer_grid(mesh: Mesh, nodes: np.ndarray) -> tuple[int, int, int]:
 
 def averaged(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     """Mean at each point of the values its cells have there; cells, values: (n_en, n_cells)."""
-    total = np.bincount(cells.ravel(), values.ravel(), n)
-    return total / np.bincount(cells.ravel(), minlength=n)
+    return _summed(cells, values, n) / np.bincount(cells.ravel(), minlength=n)
+
+
+def _summed(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+    """Sum at each point of what its cells give it; cells: (n_en, n_cells), values: that or (n_cells,)."""
+    return np.bincount(cells.ravel(), np.broadcast_to(values, cells.shape).ravel(), n)
 
 
 _facet_contact = jax.jit(facet_contact)
@@ -193,6 +200,7 @@ def whole(layer: LayerFields) -> LayerFields:
         cells=np.concatenate(cells, axis=1),
         point_data={name: _image(name, v[source], sign) for name, v in layer.point_data.items()},
         cell_data={name: np.tile(v, len(signs)) for name, v in layer.cell_data.items()},
+        volumes=np.bincount(numbers.ravel(), np.tile(layer.volumes, len(signs))),
         symmetry=Symmetry(""),
         grid=None,
         fibres=tuple(v[source] for v in layer.fibres),

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -89,18 +90,23 @@ def _tell_of_cache() -> None:
     sys.stderr.write("note: JAX's compilation cache is damaged: programs are compiled anew; empty it\n")
 
 
+LONGEST_SILENCE = 5.0
+"""s after which news of a stage are told however little of it is done meanwhile"""
+
+
 class PlainLines:
-    """A line on standard error for each stage, each further twentieth of it, and its end."""
+    """A line on standard error for each stage, its every twentieth, its end, and after `LONGEST_SILENCE`."""
 
     def __init__(self) -> None:
-        self.stage, self.fraction = "", 0.0
+        self.stage, self.fraction, self.told = "", 0.0, 0.0
 
     def __call__(self, event: Any) -> None:
         gained = event.fraction - self.fraction
         finished = event.fraction >= 1.0 and gained > 0.0
-        if event.stage == self.stage and gained < 0.05 and not finished:
+        silent = time.monotonic() - self.told < LONGEST_SILENCE
+        if event.stage == self.stage and gained < 0.05 and silent and not finished:
             return
-        self.stage, self.fraction = event.stage, event.fraction
+        self.stage, self.fraction, self.told = event.stage, event.fraction, time.monotonic()
         sys.stderr.write(f"{event.stage}: {event.fraction:4.0%}  {event.message}".rstrip() + "\n")
         sys.stderr.flush()
 

@@ -48,7 +48,7 @@ table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nu
 th, td { text-align: left; padding: .3rem .8rem .3rem 0; border-bottom: 1px solid var(--rule);
   vertical-align: top; }
 th { font-weight: 600; color: var(--faint); }
-td.number, th.number { text-align: right; white-space: nowrap; padding-right: 1.4rem; }
+td.number, th.number { text-align: right; padding-right: 1.4rem; } td.number { white-space: nowrap; }
 .scroll + .scroll { margin-top: 1.4rem; }
 .good, .look { color: var(--good); font-weight: 600; white-space: nowrap; } .look { color: var(--look); }
 figure { margin: 1.4rem 0; break-inside: avoid; }
@@ -156,7 +156,14 @@ def _opening(title: str, content: dict[str, Any], result: Result) -> str:
     model = content["model"]
     lines = [f"<h1>{escape(title)}</h1>"]
     counts = f"{model['elements']:,} elements ({model['element']}), {model['unknowns']:,} unknowns"
-    lines.append(f'<p class="faint">{escape(counts)}, {len(result.states)} converged states</p>')
+    counts += f", {len(result.states)} converged states"
+    own = result.scene.mesh.words
+    if coarser := sorted({record["mesh"] for record in content["history"]} - {own}):
+        counts += (
+            f"; the closing path was walked on {' and '.join(coarser)} elements, "
+            f"the states in the body and at the stop are of {own}"
+        )
+    lines.append(f'<p class="faint">{escape(counts)}</p>')
     if not content["converged"]:
         reason = content["failure"] or "the stop was not reached"
         lines.append(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from jaxclamp.core.failures import TooLittleMemory
-from jaxclamp.core.memory import ADDRESSES, free_MB, resident_MB
+from jaxclamp.core.memory import ADDRESSES, limits_MB, resident_MB
 from jaxclamp.fem.tube import build_tube, supports
-from jaxclamp.scenes.scene import MeshSettings
+from jaxclamp.scenes.scene import MeshSettings, Scene
 
 START, PER_UNKNOWN = 850.0, 0.03
 """MB: Python with its compiled programs and the error estimates, and what each unknown adds (human-lad on
@@ -27,17 +27,32 @@ def predicted_MB(unknowns: int) -> float:
     return START + PER_UNKNOWN * unknowns
 
 
-def require_memory(unknowns: int) -> None:
-    """Raise TooLittleMemory if a scene with so many unknowns will not fit, as far as that is known."""
-    taken, free = resident_MB(), free_MB()
-    if taken is None or free is None:
+def require_memory(unknowns: int, processes: int = 1) -> None:
+    """Raise TooLittleMemory if a scene with so many unknowns will not fit, as far as that is known.
+
+    processes: this one and others, a study's starts, that solve such scenes at the same time; a limit on
+        addresses is one for each
+    """
+    taken = resident_MB()
+    if taken is None:
         return
-    left, by = free
-    more = max(predicted_MB(unknowns) - taken, 0.0)
-    if by == ADDRESSES and more > 0.0:
-        more = ADDRESSES_PER_MB * more + ADDRESSES_PER_UNKNOWN * unknowns**ADDRESSES_EXPONENT
-    if more > left:
+    alone = max(predicted_MB(unknowns) - taken, 0.0)
+    together = alone + (processes - 1) * predicted_MB(unknowns)
+    addresses = ADDRESSES_PER_MB * alone + ADDRESSES_PER_UNKNOWN * unknowns**ADDRESSES_EXPONENT
+    for left, by in limits_MB():
+        more = (addresses if alone else 0.0) if by == ADDRESSES else together
+        if more <= left:
+            continue
+        what, less = f"the scene has {unknowns} unknowns and needs", "fewer mesh elements (--fidelity draft)"
+        if processes > 1 and by != ADDRESSES:
+            what = f"{processes} starts at once, each of {unknowns} unknowns, need"
+            less = f"fewer starts or {less}"
         raise TooLittleMemory(
-            f"the scene has {unknowns} unknowns and needs about {more:.0f} MB more, and {by} leaves "
-            f"{max(left, 0.0):.0f} MB: take fewer mesh elements (--fidelity draft), or allow more memory"
+            f"{what} about {more:.0f} MB more, and {by} leaves {max(left, 0.0):.0f} MB: "
+            f"take {less}, or allow more memory"
         )
+
+
+def require_memory_for(scene: Scene, processes: int) -> None:
+    """Raise TooLittleMemory if so many processes that solve a scene at the same time will not fit."""
+    require_memory(unknowns_of(scene.mesh), processes)

@@ -37,6 +37,8 @@ from jaxclamp.solve.linear_solvers import available
 from jaxclamp.solve.results import Result, versions
 from jaxclamp.trust.estimates import SOURCES, bulk_paths, estimate, figures, multiplied
 
+STAGE = "accuracy"
+"""of what is told while it is measured"""
 REFERENCE_MESHES = (1.0, 1.5, 2.0)
 """elements per direction, over the scene's, that the reference is extrapolated from"""
 WARM_UP = 0.02
@@ -214,14 +216,15 @@ def measure(rungs: list[Rung], tell: Callable[[Progress], Any]) -> list[Price]:
     found: list[Price] = []
     context = multiprocessing.get_context("spawn")
     for number, rung in enumerate(rungs):
-        tell(Progress("accuracy", number / len(rungs), f"{rung.group}: {rung.setting}"))
+        said = f"variant {number + 1} of {len(rungs)}, {rung.group}: {rung.setting}"
+        tell(Progress(STAGE, number / len(rungs), said))
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             try:
                 found.append(pool.submit(call, packed(solve, rung)).result())
             except (MemoryError, OSError, BrokenExecutor, jax.errors.JaxRuntimeError) as error:
                 # out of memory, in one of the ways in which that shows
                 found.append(Price(rung.group, rung.setting, None, f"the machine refused: {error}"))
-    tell(Progress("accuracy", 1.0, f"{len(rungs)} variants"))
+    tell(Progress(STAGE, 1.0, f"{len(rungs)} variants"))
     return found
 
 
@@ -318,9 +321,15 @@ def price_list(scene: Scene, progress: Callable[[Progress], Any] | None = None) 
 
     Raises EquilibriumError if the scene has no solution, NoReference if a finer mesh has none.
     """
-    own = clamp(scene)
+    tell, rungs = progress or (lambda event: None), ladder(scene)
+    share = 1.0 / (1 + len(rungs))
+    tell(Progress(STAGE, 0.0, f"the scene itself, then {len(rungs)} variants of it; compiling"))
+    last = lambda e: tell(Progress(STAGE, 0.0, f"the scene itself, {e.stage}: {e.message}"))  # noqa: E731
+    own = clamp(scene, progress=last)
+    tell(Progress(STAGE, 0.0, "the scene itself: where its errors come from"))
     sources = estimate(own)
-    prices = measure(ladder(scene), progress or (lambda event: None))
+    heard = lambda e: tell(dataclasses.replace(e, fraction=share + (1.0 - share) * e.fraction))  # noqa: E731
+    prices = measure(rungs, heard)
     by_mesh = {p.setting: p for p in prices if p.group == "mesh"}
     fine = [by_mesh[counts(scaled(scene.mesh, factor))] for factor in REFERENCE_MESHES]
     solved = [(p, p.figures) for p in fine if p.figures is not None]

@@ -118,10 +118,10 @@ def proc(tmp_path, monkeypatch):
 
 
 def test_the_least_of_machine_and_container_is_what_is_left(proc):
-    assert memory.free_MB() == (600.0, "the container")
+    assert memory.limits_MB()[0] == (600.0, "the container")
     assert memory.resident_MB() == 256.0
     (proc / "cgroup" / "pod" / "memory.max").write_text("max\n")
-    assert memory.free_MB() == (4096.0, "the machine")
+    assert memory.limits_MB() == [(4096.0, "the machine")]
 
 
 def test_containers_of_version_1_are_seen(proc):
@@ -130,7 +130,7 @@ def test_containers_of_version_1_are_seen(proc):
     (proc / "cgroup" / "memory" / "memory.limit_in_bytes").write_text(f"{300 * 2**20}\n")
     (proc / "cgroup" / "memory" / "memory.usage_in_bytes").write_text(f"{100 * 2**20}\n")
     (proc / "cgroup" / "memory" / "memory.stat").write_text("cache 1\n")
-    assert memory.free_MB() == (200.0, "the container")
+    assert memory.limits_MB()[0] == (200.0, "the container")
 
 
 def test_a_scene_that_does_not_fit_is_refused_before_anything_is_solved(proc):
@@ -143,9 +143,20 @@ def test_a_scene_that_does_not_fit_is_refused_before_anything_is_solved(proc):
         jc.clamp(scene)
 
 
+def test_processes_at_once_are_counted_together(proc, monkeypatch):
+    """636 MB as above, and twice 892 MB; a limit on addresses is one for each."""
+    (proc / "cgroup" / "pod" / "memory.max").write_text("max\n")
+    needs.require_memory(1400, 3)
+    (proc / "proc" / "meminfo").write_text("MemAvailable: 1048576 kB\n")
+    with pytest.raises(jc.TooLittleMemory, match=r"^3 starts at once, each of 1400 unknowns, need about 24"):
+        needs.require_memory(1400, 3)
+    monkeypatch.setattr(memory, "_of_machine", lambda: (1024.0, memory.ADDRESSES))
+    needs.require_memory(1400, 3)
+
+
 def test_where_the_system_does_not_tell_nothing_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "PROC", tmp_path)
-    assert memory.free_MB() is None
+    assert memory.limits_MB() == []
     needs.require_memory(10**9)
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
-from optimize.front import Front, Point
+from optimize.front import BEATEN, WITHIN, Front, Point
+from optimize.front_report import page, plot_front
 from optimize.study_file import load_study
 
 STUDY = """
@@ -71,16 +74,55 @@ def test_a_wrong_front_is_one_sentence_and_exit_code_2(tmp_path, capsys, old, ne
     assert said in captured.err
 
 
+def front_of(folder: Path, rows: dict[str, tuple[float, float]], errors: dict[str, float]) -> Front:
+    """A made-up front; errors: of the first objective, of no source in common with the others."""
+    asked = load_study(written(folder)).problem
+    result: Any = SimpleNamespace(final={})
+    points = [Point(n, None, asked.start, 0.0, result, 1, "") for n in rows if n.startswith("point")]
+    estimates = {
+        name: {
+            PEAK: jc.Estimate(first, {"mesh": errors.get(name, 0.0)}),
+            PRESSURE: jc.Estimate(second, {"mesh": 0.0}),
+        }
+        for name, (first, second) in rows.items()
+    }
+    return Front(asked, PRESSURE, tuple(points), estimates, 0.0)
+
+
+ROWS = {"point-1": (1.0, 5.0), "point-2": (2.0, 3.0), "point-3": (2.5, 3.0), "point-4": (4.0, 1.0)}
+
+
 def test_a_point_is_beaten_by_one_that_is_better_in_both(tmp_path):
-    asked = load_study(written(tmp_path))
-    points = tuple(
-        Point(f"point-{i}", None, asked.problem.start, values, 0.0, None, 1, "")  # type: ignore[arg-type]
-        for i, values in enumerate([(1.0, 5.0), (2.0, 3.0), (2.5, 3.0), (4.0, 1.0)], 1)
-    )
-    found = Front(asked.problem, PRESSURE, points, {}, 0.0)
-    assert [found.is_beaten(p) for p in points] == [False, False, True, False]
-    beside = Front(asked.problem, PRESSURE, points, {"reference": (3.5, 0.5)}, 0.0)
-    assert [beside.is_beaten(p) for p in points] == [False, False, True, True]
+    found = front_of(tmp_path, ROWS, {})
+    assert [found.standing(name) for name in ROWS] == ["", "", BEATEN, ""]
+    beside = front_of(tmp_path, ROWS | {"reference": (3.5, 0.5)}, {})
+    assert [beside.standing(name) for name in ROWS] == ["", "", BEATEN, BEATEN]
+    assert beside.others == ["reference"]
+
+
+@pytest.mark.parametrize(
+    ("errors", "word"),
+    [
+        ({"point-3": 0.6}, WITHIN),  # by 0.5 in the one objective, not at all in the other
+        ({"point-3": 0.6, "point-2": 0.5}, BEATEN),  # most of the error is the other's, too
+        ({"point-3": 0.4}, BEATEN),
+    ],
+)
+def test_a_point_that_is_beaten_within_its_error_is_said_so(tmp_path, errors, word):
+    """The error of the difference counts: what both have in common cancels."""
+    found = front_of(tmp_path, ROWS, errors)
+    assert found.standing("point-3") == word
+    told = found.to_dict()["front"][2]
+    assert told["beaten"]
+    assert told["beaten_within_error"] == (word == WITHIN)
+    assert told["errors"] == [pytest.approx(errors["point-3"]), 0.0]
+    assert found.rows()[2][f"error of {PEAK}"] == pytest.approx(errors["point-3"])
+    assert any(line.endswith(word) and "2.5 ± " in line for line in found.lines())
+    assert f"2.5 ± {errors['point-3']:g}" in (text := page(found, "Front", []))
+    assert ("within its error" in text) == (word == WITHIN)
+    bars = [c for c in plot_front(found).axes[0].containers if c.has_xerr]
+    ends = [bar.lines[2][0].get_segments()[0][:, 0] for bar in bars]
+    assert any(np.ptp(end) == pytest.approx(2.0 * errors["point-3"]) for end in ends)
 
 
 @pytest.mark.slow
@@ -105,6 +147,8 @@ def test_a_front_is_swept_resumed_and_drawn(tmp_path, capsys):
     best = jc.clamp(jc.load_scene(out / "point-3" / "best" / "scene.toml"))
     assert best.measure(PRESSURE) == pytest.approx(second[-1], rel=1e-5)
     assert best.measure(PEAK) == pytest.approx(first[-1], rel=1e-5)
+    near = jc.neighbours(best).estimates((PEAK, PRESSURE))
+    assert found["front"][-1]["errors"] == pytest.approx([near[m].error for m in (PEAK, PRESSURE)], rel=1e-2)
 
     # a second study there needs --resume; one that was cut off goes on with what it has
     assert main(command) == 2

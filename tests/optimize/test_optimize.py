@@ -20,11 +20,12 @@ import pytest
 import jaxclamp as jc
 from jaxclamp.cli import main
 from jaxclamp.core.failures import NotConverged
-from optimize import Constraint, DesignProblem, Variable, minimise
+from optimize import Constraint, DesignProblem, Variable, evaluator, minimise, starts
 from optimize.drivers import METHODS, Enough, Target
 from optimize.evaluator import evaluate, gradients
 from optimize.journal import Journal, write_whole
 from optimize.named_measures import named
+from optimize.record import Record
 from optimize.starts import other_starts
 from optimize.study_file import load_study
 from optimize.variables import entries, with_design
@@ -262,6 +263,17 @@ def test_a_state_that_a_cold_solution_does_not_find_is_no_design(monkeypatch):
     assert all("from scratch" in e.failure for e in lied)
 
 
+def test_the_first_design_is_told_before_it_is_solved(monkeypatch):
+    def stop(problem, design, near):
+        raise NotImplementedError
+
+    told: list[jc.Progress] = []
+    monkeypatch.setattr(evaluator, "evaluate", stop)
+    with pytest.raises(NotImplementedError):
+        evaluator.Evaluator(Record(one_slope(), "slsqp", []), None, 4, told.append).at(np.array([0.5]))
+    assert [(event.fraction, event.message) for event in told] == [(0.0, "design 1, with compilation")]
+
+
 def test_other_starts_are_possible_and_reproducible():
     problem = one_slope()
     first, again = other_starts(problem, 3), other_starts(problem, 3)
@@ -269,6 +281,22 @@ def test_other_starts_are_possible_and_reproducible():
     assert len({design.tobytes() for design in first}) == 3
     lower, upper = problem.bounds
     assert all(np.all(lower <= d) and np.all(d <= upper) for d in first)
+
+
+def test_starts_that_do_not_fit_are_refused_before_anything_is_solved(monkeypatch):
+    """As many processes as there are cores, and this one."""
+    asked: list[int] = []
+
+    def refuse(scene, processes):
+        asked.append(processes)
+        raise jc.TooLittleMemory("too little")
+
+    monkeypatch.setattr(starts, "require_memory_for", refuse)
+    monkeypatch.setattr(starts, "cores", lambda: 2)
+    for count in (1, 2, 8):
+        with pytest.raises(jc.TooLittleMemory):
+            minimise(one_slope(), starts=count)
+    assert asked == [1, 2, 3]
 
 
 @pytest.mark.slow

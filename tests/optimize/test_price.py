@@ -15,7 +15,7 @@ from jaxclamp.pictures.fields import contact_along
 from jaxclamp.scenes.presets import presets as shipped
 from optimize import Constraint, DesignProblem, Variable
 from optimize.evaluator import Evaluator
-from optimize.figures import labelled, plot_convergence
+from optimize.figures import labelled, plot_convergence, plot_profiles, profile
 from optimize.gains import Gain
 from optimize.named_measures import in_words
 from optimize.price import BETTER, SAME, UNKNOWN, WORSE, Change, Compared, injuries
@@ -158,6 +158,29 @@ def test_convergence_is_drawn_without_a_feasible_design():
     tried = [Evaluation(asked.start, np.array([v, 5.0]), np.zeros((2, 3)), 5) for v in (31.0, 30.0)]
     axes = plot_convergence(SimpleNamespace(problem=asked, evaluations=tried)).axes[0]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["violates a constraint"]
+
+
+def with_jaw(jaw: str) -> SimpleNamespace:
+    return SimpleNamespace(scene=jc.load_scene("human-lad", [f"clamp.jaw={jaw}"]))
+
+
+STEEP = '{shape="spline", half_width_mm=2.0, slopes=[8.0, 10.0, 20.0], edge_radius_mm=0.8}'
+
+
+def test_faces_are_drawn_whole():
+    """A cylinder by its circle, a spline steeper than any that is shipped by its own height."""
+    bar, steep = with_jaw("cylinder-3mm"), with_jaw(STEEP)
+    z, y = profile(bar)
+    np.testing.assert_allclose(y, 3.0 - np.sqrt(9.0 - z**2), atol=0.01)
+    z, y = profile(steep)
+    jaw, face = steep.scene.clamp.jaw, np.isfinite(y)
+    inner = np.abs(z) < 1.7
+    np.testing.assert_allclose(y[inner], jaw.height(np.abs(z[inner]))[0], atol=1e-9)
+    assert np.nanmax(y) > float(jaw.height(np.asarray(1.99))[0]) > 15.0
+    axes = plot_profiles(SimpleNamespace(reference=None, start=bar, best=steep)).axes[0]
+    assert axes.get_ylim()[0] < 0.0 < np.nanmax(y) < axes.get_ylim()[1]
+    assert axes.get_xlim()[0] < -3.0 < 3.0 < axes.get_xlim()[1]
+    assert np.ptp(z[face]) > 3.9
 
 
 def test_the_contact_pressure_along_the_artery_has_the_reported_peak(pair):

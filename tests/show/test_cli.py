@@ -498,3 +498,20 @@ def test_a_reader_that_goes_away_is_no_error(tmp_path):
     )
     os.close(write_end)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_plain_lines_break_a_long_silence(monkeypatch, capsys):
+    """A line for each twentieth of a stage, and for the first news after five seconds."""
+    now = [100.0]
+    monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+    tell = console.PlainLines()
+    given = ((0.0, 100.0), (0.01, 104.0), (0.02, 106.0), (0.03, 110.0), (0.08, 110.1), (1.0, 110.2))
+    for fraction, at in given:
+        now[0] = at
+        tell(types.SimpleNamespace(stage="accuracy", fraction=fraction, message=f"at {at:g} s"))
+    assert capsys.readouterr().err.splitlines() == [
+        "accuracy:   0%  at 100 s",
+        "accuracy:   2%  at 106 s",
+        "accuracy:   8%  at 110.1 s",
+        "accuracy: 100%  at 110.2 s",
+    ]

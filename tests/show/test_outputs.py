@@ -23,6 +23,8 @@ from jaxclamp.fem.tube import closed_positions
 from jaxclamp.observe.figures import shown_in
 from jaxclamp.observe.stresses import stresses
 from jaxclamp.pictures import fields, plots
+from jaxclamp.pictures.plots import style
+from jaxclamp.pictures.plots.style import colours
 from jaxclamp.potential.energy import with_equilibrium_pressure
 from jaxclamp.potential.model import build_model
 from jaxclamp.show import export, paraview
@@ -300,6 +302,7 @@ def pressed(symmetry: str, element: str = "q1p0"):
         closing=(load_free, last),
         history=[{"jaw_travel_mm": travel, "occlusion": 0.5 * travel} for travel in (0.0, 1.0)],
         converged=True,
+        coarser=None,
     )
 
 
@@ -322,6 +325,8 @@ def test_the_whole_artery_is_the_same_however_much_is_modelled(symmetry):
         }
         for name, values in expected.point_data.items():
             np.testing.assert_allclose(found.point_data[name][place], values, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(found.volumes[place], expected.volumes)
+        assert few.volumes.sum() == pytest.approx(expected.volumes.sum() / 8.0)
         corners = list(found.element.meshio_nodes)
         sizes, least = volumes(found.points, found.cells[corners].T)
         assert least > 0.0
@@ -384,6 +389,33 @@ def test_pictures_have_both_walls_and_every_peak(symmetry):
         shown = np.abs(layer.points[:, 2]) <= zoom
         highest = np.argmax(np.where(shown, layer.point_data["axial_stress_kPa"], -np.inf))
         assert np.abs(np.abs(crosses[:, 0]) - np.abs(layer.points[highest, 2])).max() < 1e-9
+
+
+def test_colours_are_not_stretched_by_a_fold_that_the_mesh_does_not_resolve():
+    """A thousandth of the volume is beyond them, with an arrow and in words; a hundredth is not."""
+    smooth, few = np.linspace(2.0, 38.0, 1000), np.array([-40.0, 61.36])
+    values, weights = np.concatenate([smooth, few]), np.concatenate([np.ones(1000), [1.0, 1.0]])
+    found = colours([values, smooth], [weights, np.ones(1000)], 5.0)
+    assert found.limits == (0.0, 40.0)
+    assert found.extremes == (-40.0, 61.36)
+    assert found.beyond == "both"
+    assert "\N{MINUS SIGN}40 to 61.4" in found.said("volume")
+    assert "0.5th to 99.5th percentile by volume" in found.said("volume")
+    all_of_it = colours([values], [np.concatenate([np.ones(1000), [10.0, 10.0]])], 5.0)
+    assert all_of_it.limits == (-40.0, 65.0)
+    assert (all_of_it.beyond, all_of_it.said("volume")) == ("neither", "")
+
+
+def test_the_bar_of_a_stress_map_says_what_lies_beyond_it(monkeypatch):
+    monkeypatch.setattr(style, "OUTSIDE", 0.1)
+    bar = plots.plot_axial_stress_maps(pressed("xyz")).axes[-1]
+    low, high = map(float, re.search(r"in all (\S+) to ([^;]+);", plain_minus(bar.get_ylabel())).groups())
+    assert low < bar.get_ylim()[0] or high > bar.get_ylim()[1]
+    assert "10th to 90th percentile by volume" in bar.get_ylabel()
+
+
+def plain_minus(text: str) -> str:
+    return text.replace("\N{MINUS SIGN}", "-")
 
 
 def _pixels(figure) -> np.ndarray:

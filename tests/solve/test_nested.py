@@ -10,7 +10,9 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.core.failures import NotConverged
+from jaxclamp.pictures import plots
 from jaxclamp.potential.tangent import linearise
+from jaxclamp.show.report import page
 from jaxclamp.solve import clamping, nested
 from jaxclamp.solve.branch import CLOSING_PATH
 
@@ -107,3 +109,23 @@ def test_small_meshes_and_constants_of_each_point_are_walked_themselves(monkeypa
     assert nested.to_walk_on(points) is None
     monkeypatch.setattr(nested, "LEAST_CELLS", 100)
     assert nested.to_walk_on(walked) is None
+
+
+def test_curves_are_of_one_mesh_and_the_step_to_the_scenes_own_is_explained():
+    """The last state lies beside the curve, under a mark that the legend names."""
+    for way in ("coarser", "own"):
+        result = solved(way)
+        path = result.coarser or result
+        for draw in (plots.plot_force_travel, plots.plot_stress_at_P):
+            figure = draw(result)
+            key = "clamp_force_N" if draw is plots.plot_force_travel else "axial_stress_ratio_at_P"
+            drawn = [line.get_xydata().tolist() for line in figure.axes[0].lines]
+            curve = [[record["jaw_travel_mm"], record[key]] for record in path.history]
+            assert curve in drawn
+            assert [[result.final["jaw_travel_mm"], result.final[key]]] in drawn
+            said = [t.get_text() for t in figure.axes[-1].get_legend().get_texts()]
+            known = [f"curve: {path.scene.mesh.words} elements", f"A, F: {result.scene.mesh.words} elements"]
+            assert (said[-2:] == known) == (way == "coarser")
+        (key,) = plots.plot_sections(result).legends
+        assert (path.scene.mesh.words in key.get_title().get_text()) == (way == "coarser")
+        assert (f"walked on {path.scene.mesh.words}" in page(result, [])) == (way == "coarser")

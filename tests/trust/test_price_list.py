@@ -11,6 +11,7 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
+from jaxclamp.core.progress import Progress
 from jaxclamp.show.price_report import lines, markdown, write_prices
 from jaxclamp.trust import price_list as accuracy
 from jaxclamp.trust.price_list import GRADIENT, Price, PriceList, ladder, richardson, scaled
@@ -126,6 +127,31 @@ def test_what_is_refused_has_no_figures():
     assert price.figures is None
     assert "no equilibrium" in price.failure
     assert math.isnan(price.seconds)
+
+
+def test_what_is_done_is_told_before_the_first_variant(monkeypatch):
+    """The scene itself is solved first: what it tells is passed on, and counts as one of the variants."""
+    told: list[Progress] = []
+
+    def clamp(scene, *, progress):
+        assert told[0].message.startswith("the scene itself, then ")
+        progress(Progress("load-free", 0.7, "closing the open sectors"))
+        return "solved"
+
+    def measure(rungs, tell):
+        tell(Progress("accuracy", 0.5, "half of them"))
+        raise NotImplementedError
+
+    monkeypatch.setattr(accuracy, "clamp", clamp)
+    monkeypatch.setattr(accuracy, "estimate", lambda result: {})
+    monkeypatch.setattr(accuracy, "measure", measure)
+    scene = jc.load_scene("human-lad", TINY)
+    with pytest.raises(NotImplementedError):
+        accuracy.price_list(scene, told.append)
+    assert {event.stage for event in told} == {"accuracy"}
+    assert told[1].message == "the scene itself, load-free: closing the open sectors"
+    count = 1 + len(accuracy.ladder(scene))
+    assert [event.fraction for event in told[1:]] == pytest.approx([0.0, 0.0, 0.5 + 0.5 / count])
 
 
 @pytest.mark.slow

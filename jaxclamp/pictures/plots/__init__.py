@@ -39,6 +39,10 @@ class Plate:
     figure: Picture
 
 
+STEP = (
+    "Where the closing path was walked on a coarser mesh, the curve is that mesh's alone, and filled "
+    "marks beside it are of the scene's own: the step between them is what the mesh changes."
+)
 PLATES = (
     (
         "wall_stress",
@@ -59,21 +63,23 @@ PLATES = (
         "stress_at_P",
         "Stress at P",
         "Axial and circumferential stress at P, the inner surface under the middle of the jaw, over "
-        "their values in the body; letters mark the sections shown.",
+        f"their values in the body; letters mark the sections shown. {STEP}",
         plot_stress_at_P,
     ),
     (
         "axial_stress_maps",
         "Axial stress in the layers",
         "Axial Cauchy stress in the last state: each layer unrolled, with the highest value through "
-        "its thickness (left; a cross marks the highest of all), and as it lies under the jaw (right).",
+        "its thickness (left; a cross marks the highest of all), and as it lies under the jaw (right). "
+        "Arrows on the bar of colours: a small part of a layer, mostly where the mesh is too coarse for a "
+        "fold, has stresses beyond them.",
         plot_axial_stress_maps,
     ),
     (
         "force_travel",
         "Force and occlusion",
         "Force on one jaw, and occlusion of the lumen by height and by area, against the travel of "
-        "each jaw from first contact.",
+        f"each jaw from first contact. {STEP}",
         plot_force_travel,
     ),
 )

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
-from jaxclamp.pictures.plots.states import Clamped, shown_states
+from jaxclamp.pictures.plots.states import Clamped, meshes_of, path_of, shown_states
 from jaxclamp.pictures.plots.style import (
     AXIAL,
     CIRCUMFERENTIAL,
@@ -27,8 +28,7 @@ def _column(history: Sequence[dict[str, Any]], key: str) -> list[float]:
 
 def plot_stress_at_P(result: Clamped) -> Picture:
     """Axial and circumferential stress at P over their values in the body, against jaw travel."""
-    marked, history = shown_states(result), result.history
-    travel = _column(history, "jaw_travel_mm")
+    marked, path = shown_states(result), path_of(result).history
     figure = Picture(5.6, 3.7)
     axes = figure.add_subplot()
     axes.axhline(1.0, color=FAINT, linewidth=0.8)
@@ -36,10 +36,9 @@ def plot_stress_at_P(result: Clamped) -> Picture:
         ("axial_stress_ratio_at_P", "axial, $s_z$", AXIAL, "-", "s"),
         ("circumferential_stress_ratio_at_P", r"circumferential, $s_\theta$", CIRCUMFERENTIAL, "--", "o"),
     ):
-        values = _column(history, key)
         axes.plot(
-            travel,
-            values,
+            _column(path, "jaw_travel_mm"),
+            _column(path, key),
             color=colour,
             linestyle=line,
             marker=marker,
@@ -47,22 +46,38 @@ def plot_stress_at_P(result: Clamped) -> Picture:
             linewidth=1.8,
             label=label,
         )
-        places = list(marked.values())
+        _mark(axes, result, key, marked, colour, marker)
+    dress(axes, "travel of each jaw (mm)", "stress at P / stress at P in the body")
+    _letter_states(axes, _column(result.history, "jaw_travel_mm"), marked)
+    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    legend(axes, handles=[*axes.get_legend_handles_labels()[0], *_meshes(result, marked)], loc="best")
+    return figure
+
+
+def _mark(axes: Axes, result: Clamped, key: str, marked: dict[str, int], colour: str, marker: str) -> None:
+    """Large marks of the shown states: filled on the result's own mesh where the path has another one."""
+    walked_elsewhere = path_of(result) is not result
+    for place in marked.values():
+        own = walked_elsewhere and result.closing[place].model is result.model
         axes.plot(
-            [travel[i] for i in places],
-            [values[i] for i in places],
+            _column(result.history[place : place + 1], "jaw_travel_mm"),
+            _column(result.history[place : place + 1], key),
             linestyle="none",
             marker=marker,
             markersize=7,
-            markerfacecolor="white",
+            markerfacecolor=colour if own else "white",
             markeredgecolor=colour,
             markeredgewidth=1.6,
         )
-    dress(axes, "travel of each jaw (mm)", "stress at P / stress at P in the body")
-    _letter_states(axes, travel, marked)
-    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    legend(axes, loc="best")
-    return figure
+
+
+def _meshes(result: Clamped, marked: dict[str, int]) -> list[Line2D]:
+    """What says in a legend that the states at both ends lie beside the curve because of their finer mesh."""
+    if (meshes := meshes_of(result, marked)) is None:
+        return []
+    own, path = meshes
+    filled = Line2D([], [], color=FAINT, linestyle="none", marker="D", markersize=6, label=own)
+    return [Line2D([], [], color=FAINT, label=f"curve: {path}"), filled]
 
 
 def _letter_states(axes: Axes, travel: Sequence[float], marked: dict[str, int]) -> None:
@@ -84,7 +99,7 @@ def _letter_states(axes: Axes, travel: Sequence[float], marked: dict[str, int]) 
 
 def plot_force_travel(result: Clamped) -> Picture:
     """Force on one jaw, and occlusion of the lumen, against travel."""
-    marked, history = shown_states(result), result.history
+    marked, history = shown_states(result), path_of(result).history
     travel = _column(history, "jaw_travel_mm")
     figure = Picture(5.6, 3.7)
     axes = figure.add_subplot()
@@ -97,6 +112,7 @@ def plot_force_travel(result: Clamped) -> Picture:
         linewidth=1.8,
         label="jaw force",
     )
+    _mark(axes, result, "clamp_force_N", marked, THIRD, "o")
     dress(axes, "travel of each jaw (mm)", "force on one jaw (N)")
     axes.set_ylim(bottom=0.0)
     second = axes.twinx()
@@ -115,6 +131,6 @@ def plot_force_travel(result: Clamped) -> Picture:
     second.set_ylim(0.0, 100.0)
     axes.yaxis.label.set_color(THIRD)
     second.yaxis.label.set_color(CIRCUMFERENTIAL)
-    _letter_states(axes, travel, marked)
-    legend(second, handles=lines, loc="upper left")
+    _letter_states(axes, _column(result.history, "jaw_travel_mm"), marked)
+    legend(second, handles=[*lines, *_meshes(result, marked)], loc="upper left")
     return figure

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -14,10 +16,11 @@ from jaxclamp.pictures.plots.states import Clamped, final_state
 from jaxclamp.pictures.plots.style import (
     INK,
     NORMAL,
+    Colours,
     Picture,
     colour_bar,
+    colours,
     dress,
-    nice_limits,
     plain,
     stress_colours,
 )
@@ -36,10 +39,8 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
     kept = final_state(result)
     layers = layer_fields(kept.model, kept.state)
     zoom = half_length_shown(result, layers)
-    limits = nice_limits(
-        [layer.point_data[FIELD][np.abs(layer.points[:, 2]) <= zoom] for layer in layers], 5.0
-    )
-    scale = ScalarMappable(Normalize(*limits), stress_colours())
+    shades = stress_range(layers, zoom)
+    scale = ScalarMappable(Normalize(*shades.limits), stress_colours())
     figure = Picture(9.6, 2.75 * len(layers) + 0.35)
     grid = figure.add_gridspec(len(layers), 2, width_ratios=[1.0, 1.25])
     for number, layer in enumerate(layers):
@@ -55,8 +56,18 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
             grid=False,
         )
         _view(view_axes, whole_grid(layer), zoom, scale, inside=number == 0, mark_P=P)
-    colour_bar(figure, scale, "axial Cauchy stress (kPa)")
+    colour_bar(figure, scale, f"axial Cauchy stress (kPa){shades.said('volume')}", shades.beyond)
     return figure
+
+
+def stress_range(layers: Sequence[LayerFields], zoom: float) -> Colours:
+    """The range of colours for the axial stress of some layers, kPa; zoom: half the length shown, mm."""
+    shown = [np.abs(layer.points[:, 2]) <= zoom for layer in layers]
+    return colours(
+        [layer.point_data[FIELD][at] for layer, at in zip(layers, shown, strict=True)],
+        [layer.volumes[at] for layer, at in zip(layers, shown, strict=True)],
+        5.0,
+    )
 
 
 def half_length_shown(result: Clamped, layers: tuple[LayerFields, ...]) -> float:

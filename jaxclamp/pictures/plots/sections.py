@@ -9,7 +9,7 @@ from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
 
 from jaxclamp.pictures.fields import WholeGrid, jaw_height_shown, jaw_outline, whole_positions
-from jaxclamp.pictures.plots.states import Clamped, shown_states
+from jaxclamp.pictures.plots.states import Clamped, meshes_of, shown_states
 from jaxclamp.pictures.plots.style import INK, JAW, JAW_EDGE, LARGE, SMALL, Picture, layer_colour, plain
 
 COLUMNS = 2
@@ -59,7 +59,7 @@ def plot_sections(result: Clamped) -> Picture:
         left.set_title(letter, fontsize=LARGE, color=INK, loc="left", fontweight="bold")
         said = f"travel {record['jaw_travel_mm']:.2f} mm, occlusion {record['occlusion']:.1%}"
         right.set_title(said if place else "in the body", fontsize=SMALL, color=INK, loc="right")
-    _key(figure, result, figure.axes[1], up, along)
+    _key(figure, result, meshes_of(result, states), figure.axes[1], up, along)
     return figure
 
 
@@ -112,8 +112,15 @@ def _frame(axes: Axes, half_width: float, half_height: float) -> None:
         spine.set_visible(False)
 
 
-def _key(figure: Picture, result: Clamped, along: Axes, up: float, half_width: float) -> None:
-    """Names of layers and jaws, and a scale."""
+def _key(
+    figure: Picture,
+    result: Clamped,
+    meshes: tuple[str, str] | None,
+    along: Axes,
+    up: float,
+    half_width: float,
+) -> None:
+    """Names of layers and jaws, a scale, and of which mesh the states are if there are two (`meshes_of`)."""
     names = [plain(layer.name) for layer in result.scene.artery.layers]
     handles = [
         Polygon([(0, 0)], facecolor=layer_colour(i)[0], edgecolor=layer_colour(i)[1], label=name)
@@ -127,6 +134,8 @@ def _key(figure: Picture, result: Clamped, along: Axes, up: float, half_width: f
         fontsize=SMALL,
         frameon=False,
         labelcolor=INK,
+        title=None if meshes is None else f"{meshes[0]}; the path between them: {meshes[1]}",
+        title_fontsize=SMALL,
     )
     end, bar = 0.97 * half_width, _round_length(0.5 * half_width)
     along.plot([end - bar, end], [0.0, 0.0], color=INK, linewidth=2.0, solid_capstyle="butt")

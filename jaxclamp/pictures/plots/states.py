@@ -43,6 +43,8 @@ class Clamped(Protocol):
     def history(self) -> list[dict[str, Any]]: ...
     @property
     def converged(self) -> bool: ...
+    @property
+    def coarser(self) -> Clamped | None: ...
 
 
 def shown_states(result: Clamped) -> dict[str, int]:
@@ -51,6 +53,24 @@ def shown_states(result: Clamped) -> dict[str, int]:
         raise ValueError("the artery in the body did not converge: there is no closing to draw")
     places = spread([record["jaw_travel_mm"] for record in result.history], SHOWN)
     return dict(zip(letters(len(places)), places, strict=True))
+
+
+def path_of(result: Clamped) -> Clamped:
+    """The result, or that on the coarser mesh on which its closing path was walked: all of one mesh."""
+    return result if result.coarser is None else path_of(result.coarser)
+
+
+def meshes_of(result: Clamped, marked: dict[str, int]) -> tuple[str, str] | None:
+    """Letters and elements of the states on the result's own mesh, and elements of the closing path.
+
+    None if they are the same. marked: from `shown_states`
+    """
+    path = path_of(result)
+    if path is result:
+        return None
+    own = [letter for letter, place in marked.items() if result.closing[place].model is result.model]
+    own_words, path_words = (f"{r.scene.mesh.words} elements" for r in (result, path))
+    return f"{', '.join(own)}: {own_words}", path_words
 
 
 def final_state(result: Clamped) -> KeptState:

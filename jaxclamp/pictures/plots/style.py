@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from collections.abc import Sequence
 from typing import Any
@@ -80,10 +81,10 @@ def legend(axes: Axes, **options: Any) -> None:
     )
 
 
-def colour_bar(figure: Figure, colours: Any, label: str) -> None:
-    """One bar of colours (a ScalarMappable) for all maps of a figure."""
-    bar = figure.colorbar(colours, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28)
-    bar.set_label(label, fontsize=NORMAL, color=INK)
+def colour_bar(figure: Figure, colours: Any, label: str, beyond: str) -> None:
+    """One bar of colours (a ScalarMappable) for all maps of a figure, with arrows where values go beyond."""
+    bar = figure.colorbar(colours, ax=figure.axes, shrink=0.75, pad=0.02, aspect=28, extend=beyond)
+    bar.set_label(label, fontsize=SMALL, color=INK)
     bar.ax.tick_params(labelsize=SMALL, labelcolor=INK)
     bar.outline.set_visible(False)
 
@@ -100,11 +101,53 @@ def stress_colours() -> Colormap:
     return LinearSegmentedColormap.from_list("stress", colormaps["magma_r"](np.linspace(0.03, 0.9, 256)))
 
 
-def nice_limits(values: Sequence[np.ndarray], step: float) -> tuple[float, float]:
-    """Range of all values, widened to multiples of `step`."""
-    low = min(float(np.min(v)) for v in values)
-    high = max(float(np.max(v)) for v in values)
-    return step * np.floor(low / step), step * max(np.ceil(high / step), np.floor(low / step) + 1.0)
+OUTSIDE = 0.005
+"""share of what is drawn that may lie beyond either end of a range of colours"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Colours:
+    """A range of colours for all maps of a figure that single points do not stretch."""
+
+    limits: tuple[float, float]
+    """where the colours end"""
+    extremes: tuple[float, float]
+    """least and greatest of all values"""
+
+    @property
+    def beyond(self) -> str:
+        """At which ends there are values beyond the colours, as matplotlib calls it."""
+        low, high = self.extremes[0] < self.limits[0], self.extremes[1] > self.limits[1]
+        return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((low, high), "neither")
+
+    def said(self, by: str) -> str:
+        """How far the values go where the colours do not; by: what percentiles are by, such as "volume"."""
+        if self.beyond == "neither":
+            return ""
+        low, high = self.extremes
+        ends = f"{100 * OUTSIDE:g}th to {100 * (1 - OUTSIDE):g}th percentile by {by}"
+        return f", in all {low:.3g} to {high:.3g};\ncolours: {ends}".replace("-", "\N{MINUS SIGN}")
+
+
+def colours(values: Sequence[np.ndarray], weights: Sequence[np.ndarray], step: float) -> Colours:
+    """The range that leaves out at most `OUTSIDE` of any of the arrays, widened to multiples of `step`.
+
+    values, weights: of each array and its points, (n,)
+    """
+    ends = np.array([_middle(v, w) for v, w in zip(values, weights, strict=True)])
+    low, high = float(np.min(ends[:, 0])), float(np.max(ends[:, 1]))
+    low, high = step * np.floor(low / step), step * max(np.ceil(high / step), np.floor(low / step) + 1.0)
+    every = np.concatenate(values)
+    return Colours((low, high), (float(np.min(every)), float(np.max(every))))
+
+
+def _middle(values: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
+    """The values below and above which lies a share `OUTSIDE` of the weight."""
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) / np.sum(weights)
+    places = np.searchsorted(share, [OUTSIDE, 1.0 - OUTSIDE])
+    low, high = values[order][np.minimum(places, len(values) - 1)]
+    return float(low), float(high)
 
 
 def letters(count: int) -> list[str]:
