@@ -14,6 +14,7 @@ import jax  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 
 from jaxclamp.core.failures import EquilibriumError, Failure, SceneError, TooLittleMemory, Unfit, WorkerLost  # noqa: E402
+from jaxclamp.core.parts import by_value, own_parts  # noqa: E402
 from jaxclamp.core.progress import Progress  # noqa: E402
 from jaxclamp.core.records import quantity, record, static  # noqa: E402
 from jaxclamp.observe.equilibria import Equilibria  # noqa: E402
@@ -39,7 +40,7 @@ from jaxclamp.observe.measures import (  # noqa: E402
     stored_energy,
     volume_above,
 )
-from jaxclamp.observe.parts import import_parts  # noqa: E402
+from jaxclamp.observe.parts import import_parts, measures  # noqa: E402
 from jaxclamp.observe.points import (  # noqa: E402
     cauchy_stress,
     contact_pressures,
@@ -88,6 +89,7 @@ __all__ = [
     "Unfit",
     "WorkerLost",
     "axial_stress_at_P",
+    "by_value",
     "cauchy_stress",
     "circumferential_stress_at_P",
     "clamp",
@@ -110,9 +112,11 @@ __all__ = [
     "lumen_width",
     "mN",
     "mean_contact_pressure",
+    "measures",
     "mm",
     "mm2",
     "neighbours",
+    "own_parts",
     "physiological_lumen_radius",
     "quantity",
     "record",

@@ -16,8 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp import EquilibriumError, Estimate, Measure, Progress, Result, SceneError, clamp, versions
-from jaxclamp.core.parts import own_parts
+from jaxclamp import (
+    EquilibriumError,
+    Estimate,
+    Measure,
+    Progress,
+    Result,
+    SceneError,
+    clamp,
+    own_parts,
+    versions,
+)
 from optimize.gains import with_error
 from optimize.journal import Journal
 from optimize.named_measures import in_words

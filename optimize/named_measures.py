@@ -9,7 +9,6 @@ from typing import Any
 
 import jaxclamp as jc
 from jaxclamp import Measure, SceneError
-from jaxclamp.observe.parts import example_of, measures
 from jaxclamp.scenes.schema import shown
 from jaxclamp.scenes.wording import did_you_mean, shortened
 from optimize.numbers import MOST, number
@@ -60,8 +59,7 @@ def named() -> dict[str, Named]:
     """The measures that a file can name, shipped or of files that were imported, by their key, such as
     "clamp_force_N"."""
     found = {}
-    for factory in measures():
-        example = example_of(factory)
+    for factory, example in jc.measures().items():
         if not example.needs_stop:  # no design of a clamp changes it
             continue
         unit, factor = FILE_UNIT.get(example.unit, (example.unit, 1.0))

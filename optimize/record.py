@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp import dump_scene, versions
-from jaxclamp.core.parts import own_parts
+from jaxclamp import dump_scene, own_parts, versions
 from optimize.problem import DesignProblem
 
 FEASIBLE = 1e-3

@@ -23,11 +23,11 @@ from jaxclamp import (
     Scene,
     SceneError,
     WorkerLost,
+    by_value,
     cores,
     require_memory_for,
     require_possible,
 )
-from jaxclamp.core.parts import call, packed
 from optimize.drivers import METHODS, Enough
 from optimize.evaluator import Evaluator
 from optimize.journal import Journal
@@ -126,8 +126,7 @@ def elsewhere(
     try:
         yield [
             pool.submit(
-                call,
-                packed(
+                by_value(
                     from_another_start,
                     dataclasses.replace(problem, scene=problem.scene_at(design)),
                     budget,

@@ -72,16 +72,17 @@ def _parts(thing: Any) -> Iterator[Any]:
 # --- travelling -----------------------------------------------------------------------------------------
 
 
-def packed(function: Callable[..., Any], *arguments: Any) -> bytes:
-    """A call for another process: what is of a file, a script or a notebook goes by value."""
-    return cloudpickle.dumps((sources, function, arguments))
+def by_value(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """A call, without arguments, for a pool of processes, such as `pool.submit(by_value(solve, scene))`.
 
-
-def call(request: bytes) -> Any:
-    """The value of a call that was packed, in the process that it was sent to.
-
-    An error of a user's own class is a RuntimeError with its text, which others can read.
+    What is of a file of parts, of a script or of a notebook goes along by value, so that the process need not
+    be able to import it. An error of a user's own class becomes a RuntimeError with its text.
     """
+    return functools.partial(_call, cloudpickle.dumps((sources, function, arguments)))
+
+
+def _call(request: bytes) -> Any:
+    """The value of a call, in the process that it was sent to."""
     known, function, arguments = pickle.loads(request)
     sources.update(known)
     try:

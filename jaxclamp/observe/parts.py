@@ -82,13 +82,16 @@ def import_parts(path: str | Path) -> types.ModuleType:
     return module
 
 
-def measures() -> tuple[Callable[..., Measure], ...]:
-    """Every factory of a measure: those that ship, and those of files that were imported."""
-    return (*MEASURES, *(factory for module in _imported.values() for factory in _factories(module)))
+def measures() -> dict[Callable[..., Measure], Measure]:
+    """Every factory of a measure, shipped or of a file that was imported, with a measure that it makes.
+
+    The example is of the layer "media" and of a stress of 1 kPa.
+    """
+    own = [factory for module in _imported.values() for factory in _factories(module)]
+    return {factory: _example(factory) for factory in (*MEASURES, *own)}
 
 
-def example_of(factory: Callable[..., Measure]) -> Measure:
-    """A measure as the factory makes it, to tell its unit and what it needs."""
+def _example(factory: Callable[..., Measure]) -> Measure:
     return factory(**{name: ARGUMENTS[name] for name in inspect.signature(factory).parameters})
 
 
@@ -194,7 +197,7 @@ def _check_factory(factory: Callable[..., Measure], said: str) -> None:
         if name not in ARGUMENTS:
             raise SceneError(f"{what} takes {name}: a study file can give {' and '.join(ARGUMENTS)} only")
     try:
-        made = example_of(factory)
+        made = _example(factory)
     except Exception as error:
         reason = shortened(" ".join(str(error).split()), LONGEST_REASON)
         raise SceneError(f"{what} cannot be made: {type(error).__name__}: {reason}") from None

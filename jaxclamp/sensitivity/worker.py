@@ -22,7 +22,7 @@ from typing import Any
 import cloudpickle
 
 from jaxclamp.core.failures import Failure, WorkerLost
-from jaxclamp.core.parts import call, packed
+from jaxclamp.core.parts import by_value
 
 _lock = threading.Lock()
 _process: subprocess.Popen[bytes] | None = None
@@ -34,7 +34,7 @@ def call_elsewhere(function: Callable[..., Any], *arguments: Any) -> Any:
     Raises WorkerLost if the process ends meanwhile; the next call starts another.
     """
     global _process
-    request = pickle.dumps(packed(function, *arguments))
+    request = pickle.dumps(by_value(function, *arguments))
     with _lock:
         process = _process = _process or _start()
         assert process.stdin is not None
@@ -91,7 +91,7 @@ def serve() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever is printed must not mix with answers
     while requests.peek(1):
         try:
-            content = cloudpickle.dumps((True, call(pickle.load(requests))))
+            content = cloudpickle.dumps((True, pickle.load(requests)()))
         except Exception as error:
             content = cloudpickle.dumps((False, _fit_to_travel(error)))
         answers.write(content)

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from jaxclamp.core.failures import EquilibriumError, NoReference, SceneError, TooLittleMemory
-from jaxclamp.core.parts import call, packed
+from jaxclamp.core.parts import by_value
 from jaxclamp.core.progress import Progress
 from jaxclamp.fem.landmarks import layer_of_P
 from jaxclamp.observe.measures import smooth_peak_axial_stress
@@ -220,7 +220,7 @@ def measure(rungs: list[Rung], tell: Callable[[Progress], Any]) -> list[Price]:
         tell(Progress(STAGE, number / len(rungs), said))
         with ProcessPoolExecutor(1, mp_context=context) as pool:
             try:
-                found.append(pool.submit(call, packed(solve, rung)).result())
+                found.append(pool.submit(by_value(solve, rung)).result())
             except (MemoryError, OSError, BrokenExecutor, jax.errors.JaxRuntimeError) as error:
                 # out of memory, in one of the ways in which that shows
                 found.append(Price(rung.group, rung.setting, None, f"the machine refused: {error}"))

@@ -15,7 +15,6 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
-from jaxclamp.core.parts import call, packed
 from jaxclamp.core.records import concrete_subclasses
 from jaxclamp.scenes.files import loads_scene
 from jaxclamp.sensitivity.worker import call_elsewhere
@@ -190,8 +189,8 @@ def test_they_travel_by_value(folder):
     jc.import_parts("parts.py")
     scene, measure = jc.load_scene("scene.toml"), load_study("study.toml").problem.objective
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        pooled = pool.submit(call, packed(packed_seen, packed(seen, scene, measure))).result()
-    for found in (call(pooled), call_elsewhere(seen, scene, measure)):
+        back = pool.submit(jc.by_value(seen_and_back, scene, measure)).result()
+    for found in (back(), call_elsewhere(seen, scene, measure)):
         assert found == (scene, len(jax.tree_util.tree_leaves(scene)), 2.0, jc.dump_scene(scene))
 
 
@@ -204,7 +203,6 @@ from concurrent.futures import ProcessPoolExecutor
 import jax
 
 import jaxclamp as jc
-from jaxclamp.core.parts import call, packed
 from jaxclamp.physics.jaws import Cylinder
 
 @jc.record
@@ -222,7 +220,7 @@ def seen(scene):
 
 scene = jc.replace(jc.load_scene("human-lad"), "clamp.jaw", Own(radius=3.0))
 with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-    found = pool.submit(call, packed(seen, scene)).result()
+    found = pool.submit(jc.by_value(seen, scene)).result()
 assert found == (jc.dump_scene(scene), 1.5), found
 assert found[0].startswith('# needs Own of "__main__"')
 """
@@ -237,9 +235,9 @@ def test_those_of_a_notebook_travel_too(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def packed_seen(request: bytes) -> bytes:
-    """What `seen` gives, packed for the way back."""
-    return packed(tuple, call(request))
+def seen_and_back(*arguments):
+    """What `seen` gives, by value on the way back, too."""
+    return jc.by_value(tuple, seen(*arguments))
 
 
 def test_a_file_that_has_changed_takes_the_place_of_the_earlier(folder):
