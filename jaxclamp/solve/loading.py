@@ -184,7 +184,7 @@ def _in_words(parts: list[dict[str, Any]]) -> str:
     for part in parts:
         sha256 = "" if part["sha256"] is None else f", sha256 {shortened(str(part['sha256']), 11)!a}"
         said.append(f"{shortened(part['part'])!a} of {shortened(part['from'])!a}{sha256}")
-    return ", ".join(said) or "none of one's own"
+    return shortened(", ".join(said), 300) or "none of one's own"
 
 
 def _kept(group: Any, models: list[Model]) -> Kept:

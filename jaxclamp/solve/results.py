@@ -211,7 +211,7 @@ class Result:
         """Write what `jaxclamp run --out` leaves into a folder (made if missing); returns the files.
 
         README.md in it says what they are. Files of an earlier result there are replaced. Raises OSError,
-        with nothing half written.
+        with nothing half written; FileExistsError where files of such names are there without such a result.
         """
         return Result.write_outputs(self, Path(folder))
 
