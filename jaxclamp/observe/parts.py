@@ -186,8 +186,8 @@ def _check_record(cls: type, what: str, base: type, said: str) -> None:
         )
     if base is Material and (lacking := lacking_moduli(cls)):
         raise SceneError(
-            f"{said}: law {cls.__name__} has no {' and no '.join(lacking)}: expected quantities c and bulk, its "
-            'shear and bulk modulus, such as c: Array = quantity("kPa", 0.0, 1e6)'
+            f"{said}: law {cls.__name__} has no {' and no '.join(lacking)}: expected quantities c and bulk, "
+            'its shear and bulk modulus, such as c: Array = quantity("kPa", 0.0, 1e6)'
         )
     targets = [key for key, field in schema.fields_by_key(cls).items() if "range" in field.metadata]
     if base is Stop and len(targets) != 1:

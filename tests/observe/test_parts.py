@@ -295,7 +295,7 @@ BAD = {
     ),
     "no shear modulus": (
         PARTS.replace("c: jax.Array", "mu: jax.Array"),
-        "others.py: law Soft has no c: expected quantities c and bulk, its shear and bulk modulus, such as c: ",
+        "others.py: law Soft has no c: expected quantities c and bulk, its shear and bulk modulus",
     ),
     "no moduli": (
         PARTS.replace('c: jax.Array = jc.quantity("kPa", 0.0, 1e6)', "c: int = jc.static(1)").replace(

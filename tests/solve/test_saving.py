@@ -7,6 +7,7 @@ import io
 import json
 import struct
 
+import cloudpickle
 import h5py
 import jax
 import jax.numpy as jnp
@@ -105,6 +106,10 @@ def test_a_failure_comes_back_with_its_sentence_and_what_converged(tmp_path):
     assert not again.converged
     assert str(again.failure) == str(caught.value)
     assert again.failure.result is again
+    travelled = cloudpickle.loads(cloudpickle.dumps(caught.value))
+    assert (str(travelled), travelled.result) == (str(caught.value), None)
+    assert travelled.history == again.history
+    assert [record["stage"] for record in travelled.history][:2] == ["physiological", "clamping"]
     assert again.to_dict() == caught.value.result.to_dict()
     with pytest.raises(jc.EquilibriumError, match="no equilibrium in stage 'clamping'"):
         again.measure(jc.clamp_force())
