@@ -51,8 +51,8 @@ def _require_a_distance(scene: Scene) -> None:
         i = wrong[0]
         raise SceneError(
             f"clamp.jaw of shape '{jaw.shape}': expected a gap that is the distance from the face, with a "
-            f"gradient of length 1 there; it is {gap[i]:.3g} mm with one of {length[i]:.3g} at x = {x[i]:.3g}, "
-            f"y = {y[i]:.3g}, z = {z[i]:.3g} mm"
+            f"gradient of length 1 there; it is {gap[i]:.3g} mm with one of {length[i]:.3g} "
+            f"at x = {x[i]:.3g}, y = {y[i]:.3g}, z = {z[i]:.3g} mm"
         )
 
 

@@ -102,8 +102,8 @@ def _sound_content(path: str | Path, source: str) -> bytes:
 
 
 def _release(version: str) -> list[str]:
-    """The first two numbers of a version: the third changes no state."""
-    return version.split(".")[:2]
+    """The first two numbers of a version: what comes behind them changes no state."""
+    return version.partition("+")[0].split(".")[:2]
 
 
 def _require_plain(group: Any, depth: int = 0) -> None:

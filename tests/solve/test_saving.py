@@ -242,7 +242,7 @@ def test_another_version_is_named(saved, tmp_path):
         other.write_bytes(dataclasses.replace(header, **changed).to_bytes() + content[HEADER:])
         assert "saved by jaxclamp" in refused(other)
         assert "clamp its scene again" in refused(other)
-    patch = ".".join([*header.version.split(".")[:2], "99"])
+    patch = ".".join([*header.version.split(".")[:2], "99+0123abcd"])
     other.write_bytes(dataclasses.replace(header, version=patch).to_bytes() + content[HEADER:])
     assert jc.load_result(other).converged
 
