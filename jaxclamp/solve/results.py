@@ -314,7 +314,7 @@ def _radius(kept: Kept | None) -> float | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on; jaxclamp's has a digest of its sources behind it: 0.1.0+1a2b3c4d."""
+    """Versions of what the numbers depend on; behind jaxclamp's a digest of its sources: 0.1.0+1a2b3c4d."""
     names = ("jaxclamp", "jax", "jaxlib", "numpy", "scipy")
     found = {"python": platform.python_version()}
     for name in names:
