@@ -7,6 +7,7 @@ progress and notes to standard error. Only what a command needs is imported, whe
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import tempfile
@@ -182,7 +183,7 @@ def run(
     loaded = _load(scene, fidelity, overrides, quiet)
     folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-result")
     if folder is not None:
-        _check_folder(folder)
+        _check_results(folder, scene)
     from jaxclamp.scenes.notes import notes
 
     unlikely = notes(loaded)
@@ -319,6 +320,21 @@ def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: 
         said = f"on human-lad, errors of {errors}; those of this scene are estimated at the end"
         typer.echo(f"note: --fidelity {fidelity}: {said}", err=True)
     return loaded
+
+
+def _check_results(folder: Path, scene: str) -> None:
+    """Refuse a folder for the results of a scene where they would replace that scene, or files of others."""
+    from jaxclamp.show.folder import SCENE, require_ours
+
+    _check_folder(folder)
+    try:
+        if (folder / SCENE).exists() and Path(scene).exists() and (folder / SCENE).samefile(scene):
+            raise FileExistsError(errno.EEXIST, f"{scene}, the scene itself, would be replaced")
+        require_ours(folder)
+    except OSError as error:
+        raise typer.BadParameter(
+            f"{error.strerror} in {str(folder)!r}: take another folder", param_hint="--out"
+        ) from None
 
 
 def _check_folder(folder: Path) -> None:

@@ -58,7 +58,8 @@ class Exhausted(NotConverged):
 class EquilibriumError(Failure):
     """No converged equilibrium. One sentence; `result` keeps the states that did converge.
 
-    `result` stays in the process it was made in: what travels is the sentence and its parts.
+    `result` stays in the process it was made in. What travels to others is small: the sentence, its parts and
+    `history`, what was read off the states that did converge.
     """
 
     exit_code = 3
@@ -69,6 +70,12 @@ class EquilibriumError(Failure):
         self.stage, self.load, self.failure, self.advice = stage, load, failure, advice
         self.residual, self.J_min = failure.residual, failure.J_min
         self.result: Any = None
+        self._history: list[dict[str, Any]] = []
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """One record per converged state from the physiological one on, as in result.json."""
+        return self._history if self.result is None else list(self.result.history)
 
     def __str__(self) -> str:
         numbers = ""
@@ -82,7 +89,11 @@ class EquilibriumError(Failure):
         return self.stage, self.load, self.failure.reason, self.residual, self.J_min, self.advice
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return EquilibriumError, (self.stage, self.load, self.failure, self.advice)
+        return (
+            EquilibriumError,
+            (self.stage, self.load, self.failure, self.advice),
+            {"_history": self.history},
+        )
 
 
 class TermMissing(Failure):

@@ -22,6 +22,7 @@ from jaxclamp.observe.measures import MEASURES
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.physics.materials import Material
 from jaxclamp.scenes import schema
+from jaxclamp.scenes.checks import lacking_moduli
 from jaxclamp.scenes.scene import Stop
 from jaxclamp.scenes.wording import shortened
 
@@ -182,6 +183,11 @@ def _check_record(cls: type, what: str, base: type, said: str) -> None:
     if schema.tag_of(cls)[0] != tag:
         raise SceneError(
             f'{said}: {what} {cls.__name__} has no name: expected a field {tag}: str = static("...")'
+        )
+    if base is Material and (lacking := lacking_moduli(cls)):
+        raise SceneError(
+            f"{said}: law {cls.__name__} has no {' and no '.join(lacking)}: expected quantities c and bulk, "
+            'its shear and bulk modulus, such as c: Array = quantity("kPa", 0.0, 1e6)'
         )
     targets = [key for key, field in schema.fields_by_key(cls).items() if "range" in field.metadata]
     if base is Stop and len(targets) != 1:

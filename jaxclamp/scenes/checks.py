@@ -14,7 +14,7 @@ from jaxclamp.core.failures import BadKey
 from jaxclamp.core.records import UNIT_FACTOR
 from jaxclamp.physics.jaws import Spline
 from jaxclamp.scenes import schema
-from jaxclamp.scenes.scene import Layer, Scene
+from jaxclamp.scenes.scene import Artery, Layer, Scene
 from jaxclamp.scenes.schema import refuse
 
 MOST_CELLS = 200_000
@@ -43,6 +43,7 @@ SMOOTHINGS = (1e-6, 1.0)
 
 def check(scene: Scene) -> None:
     """Raise BadKey for the first thing that is impossible."""
+    check_laws(scene.artery)
     checks = (
         check_names,
         check_proportions,
@@ -54,6 +55,20 @@ def check(scene: Scene) -> None:
     )
     for one in checks:
         one(scene)
+
+
+def check_laws(artery: Artery) -> None:
+    """Every law has its moduli."""
+    for i, layer in enumerate(artery.layers):
+        if lacking_moduli(type(layer.material)):
+            law = layer.material.law
+            raise refuse(f"artery.layers[{i}].material.law", law, "a law with the quantities c and bulk")
+
+
+def lacking_moduli(law: type) -> list[str]:
+    """Which of `c` and `bulk` a law does not have; contact, tolerances and notes are made of them."""
+    quantities = {field.name for field in schema.fields_by_key(law).values() if "range" in field.metadata}
+    return [name for name in ("c", "bulk") if name not in quantities]
 
 
 def check_names(scene: Scene) -> None:

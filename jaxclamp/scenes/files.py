@@ -18,7 +18,7 @@ from jaxclamp.core.parts import own_parts
 from jaxclamp.core.surroundings import require_fit
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.scenes import schema
-from jaxclamp.scenes.checks import check
+from jaxclamp.scenes.checks import check, check_laws
 from jaxclamp.scenes.fidelity import COUNTS, FIDELITIES, mesh_for
 from jaxclamp.scenes.fitting import fitting_contact
 from jaxclamp.scenes.overrides import apply_override
@@ -195,6 +195,7 @@ def _scene(table: dict[str, Any], fidelity: str) -> Scene:
     mesh, contact = table.get("mesh", {}), table.get("contact", {})
     if "artery" in table and isinstance(mesh, dict) and isinstance(contact, dict):
         artery = schema.read(Artery, table["artery"], "artery")
+        check_laws(artery)
         table["mesh"] = schema.table(mesh_for(fidelity, artery)) | mesh
         table["contact"] = schema.table(fitting_contact(artery)) | contact
     scene = schema.read(Scene, table)

@@ -1,8 +1,12 @@
 """A second process with a JAX of its own, for work that JAX itself calls back for.
 
 JAX must not be called from inside one of its own callbacks: it may wait for itself for ever. So a
-compiled program that needs an equilibrium has it solved here. The process starts afresh (it is no fork,
-and does not run the user's script again); jaws and laws of a script or a notebook travel with their scene.
+compiled program that needs an equilibrium has it solved here. The process starts afresh; jaws and laws of a
+script or a notebook travel with their scene.
+
+It has a pipe of its own because the processes of `multiprocessing` and `concurrent.futures` do not do: a fork
+of a process that has used JAX hangs, and a spawned one runs the user's script again, which has to be guarded
+by `if __name__ == "__main__"` then. `jax.jit` has to work in any script.
 """
 
 from __future__ import annotations

@@ -23,8 +23,7 @@ from jaxclamp.core.progress import Progress
 from jaxclamp.scenes.files import dump_scene
 from jaxclamp.show import readme
 from jaxclamp.show.console import as_json
-from jaxclamp.show.jaw import PROFILE, SOLID
-from jaxclamp.show.paraview import FOLDER as STATES
+from jaxclamp.show.folder import FIGURES, HISTORY, REPORT, RESULT, SCENE, of_earlier_states, require_ours
 from jaxclamp.show.paraview import write_states
 from jaxclamp.solve.results import flat
 
@@ -33,8 +32,6 @@ if TYPE_CHECKING:
     from jaxclamp.solve.results import Result
 
 STAGING = ".jaxclamp-writing-"
-FIGURES = "figures"
-SCENE = "scene.toml"
 
 
 def write_outputs(
@@ -43,10 +40,12 @@ def write_outputs(
     """Write all outputs of a result into `folder` (made if missing); returns the files.
 
     Works for whatever states converged. Files of an earlier result in the same folder are
-    replaced, and its further states removed. Raises OSError, with nothing half written.
+    replaced, and its further states removed. Raises OSError, with nothing half written; FileExistsError
+    where files of the same names are there and no earlier result.
     """
 
     folder = Path(folder)
+    require_ours(folder)
     tell = lambda fraction, message: progress and progress(Progress("writing", fraction, message))  # noqa: E731
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
@@ -79,12 +78,12 @@ def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) 
             path = folder / FIGURES / f"{plate.name}.{suffix}"
             path.write_bytes(content)
             yield path
-    history = folder / "history.csv"
+    history = folder / HISTORY
     history.write_text(history_csv(result.history), encoding="utf-8", newline="")
     yield history
     from jaxclamp.show.report import write_report
 
-    yield write_report(result, folder / "report.html", plates)
+    yield write_report(result, folder / REPORT, plates)
     scene = folder / SCENE
     with suppress(SceneError):  # constants of each point have no place in a file
         scene.write_text(dump_scene(result.scene), encoding="utf-8")
@@ -92,7 +91,7 @@ def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) 
     text = folder / readme.NAME
     text.write_text(readme.readme(result), encoding="utf-8")
     yield text
-    final = folder / "result.json"
+    final = folder / RESULT
     final.write_text(as_json(plain(result.to_dict())) + "\n", encoding="utf-8")
     yield final
 
@@ -112,19 +111,9 @@ def into_place(staging: Path, folder: Path, written: list[Path]) -> list[Path]:
 
 def _remove_old(folder: Path, files: list[Path]) -> None:
     """Remove what an earlier result with more states left over."""
-    for old in _own_files(folder):
+    for old in of_earlier_states(folder):
         if old not in files:
             old.unlink()
-
-
-def _own_files(folder: Path) -> Iterator[Path]:
-    """The files in a folder that bear names given here and are not always there; a user's own are others."""
-    from jaxclamp.pictures.plots import PLATES
-
-    for part in ("artery", "jaws"):
-        yield from (folder / STATES).glob(f"{part}_[0-9][0-9][0-9].vtu")
-    drawn = [f"{FIGURES}/{name}.{suffix}" for name, *_ in PLATES for suffix in ("png", "svg")]
-    yield from (path for name in (*drawn, SCENE, PROFILE, SOLID) if (path := folder / name).exists())
 
 
 # --------------------------------------------------------------------------------- plain content

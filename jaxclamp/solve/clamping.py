@@ -9,11 +9,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxclamp.core.failures import EquilibriumError, SceneError, TermMissing
+from jaxclamp.core.failures import EquilibriumError, TermMissing
 from jaxclamp.core.progress import Progress, Tell, teller
 from jaxclamp.core.surroundings import require_fit
 from jaxclamp.potential.model import Model, build_model
@@ -21,6 +19,7 @@ from jaxclamp.scenes.files import require_computable
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import CLOSING_PATH, branch_of
 from jaxclamp.solve.easing import keep_hardened, with_softer_contact
+from jaxclamp.solve.gaps import require_a_gap
 from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.memory import require_memory, unknowns_of
 from jaxclamp.solve.nested import NEAR, to_walk_on
@@ -83,26 +82,6 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
         return _from_nothing(attempt, to_stop, start)
     except TermMissing:
         return _from_nothing(Clamping(model, tell, every_term=True, before=attempt), to_stop, start)
-
-
-def require_a_gap(scene: Scene) -> None:
-    """Refuse a jaw whose gap is none: not finite, closed below its lowest point, or open inside it.
-
-    Raises SceneError.
-    """
-    far = 1e3 * float(scene.artery.layers[-1].inner_radius)
-    depth = 0.1 * float(scene.clamp.jaw.half_extent())
-    heights = np.array([-far, -depth, 0.0, depth])
-    points = (jnp.zeros(4), jnp.asarray(heights), jnp.zeros(4))
-    gap = np.asarray(_gap(scene.clamp.jaw, points))
-    wanted = "a gap that is positive below the jaw's lowest point, 0 there and negative inside the jaw"
-    good = np.all(np.isfinite(gap)) and gap[0] > 0.0 and gap[1] > 0.0 and gap[3] < 0.0
-    if not good or abs(gap[2]) > 1e-6 * depth:
-        shown = ", ".join(f"{g:.3g} mm at y = {y:.3g} mm" for g, y in zip(gap, heights, strict=True))
-        raise SceneError(f"clamp.jaw of shape '{scene.clamp.jaw.shape}': expected {wanted}; it is {shown}")
-
-
-_gap = jax.jit(lambda jaw, points: jaw.gap(points))
 
 
 def _from_neighbour(

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, Failure, NotConverged, SceneError
+from jaxclamp.core.parts import own_parts
 from jaxclamp.observe.figures import FIGURES
 from jaxclamp.potential.densities import RIGID
 from jaxclamp.potential.energy import State
@@ -37,9 +38,6 @@ STAGES = ("load-free", "physiological", "clamping")
 TYPES = {"float": (float, int), "int": (int,), "bool": (bool,), "int | None": (int, type(None))}
 """what stands in JSON for a field of a record, by its annotation"""
 
-WRONG_INSIDE = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
-"""what reading a file raises that was made to look like a result"""
-
 
 class _Unsound(Exception):
     """What is wrong inside a file."""
@@ -48,10 +46,12 @@ class _Unsound(Exception):
 def load_result(path: str | Path) -> Result:
     """The result that `Result.save` wrote to a file: the same figures, gradients, errors and pictures.
 
-    Laws, jaws and stops of one's own must be imported before. The file may come from a stranger.
+    Laws, jaws and stops of one's own must be imported before, from files that have not changed since. The
+    file of the result may come from a stranger.
 
-    Raises SceneError for a file that is missing, damaged, no result, or of another version of jaxclamp (its
-    first two numbers count), TooLittleMemory for one whose mesh does not fit.
+    Raises SceneError for a file that is missing, damaged, no result, of another version of jaxclamp (its
+    first two numbers count), or made with other parts of one's own; TooLittleMemory for one whose mesh does
+    not fit.
     """
     import h5py
 
@@ -102,8 +102,8 @@ def _sound_content(path: str | Path, source: str) -> bytes:
 
 
 def _release(version: str) -> list[str]:
-    """The first two numbers of a version: the third changes no state."""
-    return version.split(".")[:2]
+    """The first two numbers of a version: what comes behind them changes no state."""
+    return version.partition("+")[0].split(".")[:2]
 
 
 def _require_plain(group: Any, depth: int = 0) -> None:
@@ -151,16 +151,40 @@ def _plain(group: Any) -> dict[str, Any]:
 
 def _model(group: Any) -> Model:
     """The model of a scene, made again."""
+    made_with = json.loads(_text(group["own_parts"]))
     try:
         outline = loads_scene(_text(group["toml"]), "its scene")
     except SceneError as error:
-        raise SceneError(f"{error} (laws, jaws and stops of your own are known once imported)") from None
+        if not made_with:
+            raise
+        raise SceneError(
+            f"{error} (made with {_in_words(made_with)}, which is known once imported)"
+        ) from None
+    if _essence(has := own_parts(outline)) != _essence(made_with):
+        raise SceneError(
+            f"expected its scene to be of the parts that it was made with, {_in_words(made_with)}; found "
+            f"{_in_words(has)}: import their file as it was then, or clamp the scene again"
+        )
     known = {name: group[f"floats/{name}"][()] for name in addresses(outline)}
     leaves = [float(leaf) if np.ndim(leaf) == 0 else leaf for leaf in known.values()]
     scene: Scene = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(outline), leaves)
     require_computable(scene)
     require_memory(unknowns_of(scene.mesh))
     return build_model(scene)
+
+
+def _essence(parts: list[dict[str, Any]]) -> set[tuple[str, str | None]]:
+    """What has to be the same of parts of a user's own; their file may have moved."""
+    return {(part["part"], part["sha256"]) for part in parts}
+
+
+def _in_words(parts: list[dict[str, Any]]) -> str:
+    """Parts of a user's own, with the beginning of their digests."""
+    said = []
+    for part in parts:
+        sha256 = "" if part["sha256"] is None else f", sha256 {shortened(str(part['sha256']), 11)!a}"
+        said.append(f"{shortened(part['part'])!a} of {shortened(part['from'])!a}{sha256}")
+    return shortened(", ".join(said), 300) or "none of one's own"
 
 
 def _kept(group: Any, models: list[Model]) -> Kept:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
 import importlib.metadata
 import math
 import platform
@@ -211,7 +213,7 @@ class Result:
         """Write what `jaxclamp run --out` leaves into a folder (made if missing); returns the files.
 
         README.md in it says what they are. Files of an earlier result there are replaced. Raises OSError,
-        with nothing half written.
+        with nothing half written; FileExistsError where files of such names are there without such a result.
         """
         return Result.write_outputs(self, Path(folder))
 
@@ -312,7 +314,7 @@ def _radius(kept: Kept | None) -> float | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Versions of what the numbers depend on; behind jaxclamp's a digest of its sources: 0.1.0+1a2b3c4d."""
     names = ("jaxclamp", "jax", "jaxlib", "numpy", "scipy")
     found = {"python": platform.python_version()}
     for name in names:
@@ -320,7 +322,18 @@ def versions() -> dict[str, str]:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
+    found["jaxclamp"] += f"+{_digest_of(Path(__file__).parents[1])}"
     return found
+
+
+@functools.cache
+def _digest_of(package: Path) -> str:
+    """The beginning of a digest of the Python files of a package: changes of the code between versions."""
+    whole = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        content = path.read_bytes()
+        whole.update(f"{path.relative_to(package).as_posix()} {len(content)}\n".encode() + content)
+    return whole.hexdigest()[:8]
 
 
 def work_balance(closing: list[Kept]) -> float | None:

@@ -3,7 +3,8 @@
 The file begins with a block of text (`Header`) that HDF5 passes over: what the file is, and the digest of the
 rest, so that damage is seen before anything is parsed. Behind it (`solve.loading` reads it back):
 
-    scenes/K     `toml`, and under `floats` every number of the scene by its address, in internal units
+    scenes/K     `toml`, and under `floats` every number of the scene by its address, in internal units;
+                 `own_parts` is what it has of a user's own, with the digests of their files
     states/K     one converged state: positions, pressures, rigid coordinates, forces and tangent there;
                  `plain` has its figures and the scene it is a state of
     results/K    `plain`: which states in which order, counts, cost, errors, failure; 0 is the result, the
@@ -29,11 +30,12 @@ import jax
 import numpy as np
 
 from jaxclamp.core.failures import SceneError
+from jaxclamp.core.parts import own_parts
 from jaxclamp.scenes.files import dump_scene, loads_scene
 from jaxclamp.scenes.scene import Scene
 
 KIND = "jaxclamp result"
-LAYOUT = 1
+LAYOUT = 2
 """raised with every change of what is in a file, or of what a scene makes (mesh, order of unknowns)"""
 HEADER = 512
 """bytes before the HDF5 part"""
@@ -162,6 +164,7 @@ def _write_scene(group: Any, scene: Scene) -> None:
         text = dump_scene(dataclasses.replace(scene, artery=first))
     loads_scene(text)  # else nobody could read the result back
     group.create_dataset("toml", data=text)
+    group.create_dataset("own_parts", data=json.dumps(own_parts(scene)))
     for name, leaf in addresses(scene).items():
         group.create_dataset(f"floats/{name}", data=np.asarray(leaf, np.float64))
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -14,6 +16,7 @@ import jaxclamp as jc
 from jaxclamp.core import memory
 from jaxclamp.core.starting import is_command_line
 from jaxclamp.solve import memory as needs
+from jaxclamp.solve import results
 
 ROOT = Path(__file__).parents[2]
 SMALL = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[1, 1]", "stop.occlusion=0.3"]
@@ -74,6 +77,22 @@ forked()
     assert second.endswith("4\n")
     assert "this process was forked from one that had used JAX" in second
     assert "get_context('spawn')" in second
+
+
+# ------------------------------------------------------------------------------------- versions
+
+
+def test_a_change_of_the_code_is_another_version(tmp_path):
+    """Of what is computed with, of the place where it lies nothing."""
+    here, there = ROOT / "jaxclamp", tmp_path / "jaxclamp"
+    assert results.versions()["jaxclamp"] == f"{version('jaxclamp')}+{results._digest_of(here)}"
+    shutil.copytree(here, there, ignore=shutil.ignore_patterns("__pycache__"))
+    (there / "notes.txt").write_text("mine")
+    assert results._digest_of(there) == results._digest_of(here)
+    file = there / "core" / "tensors.py"
+    file.write_text(file.read_text().replace("0.5", "0.6", 1))
+    results._digest_of.cache_clear()
+    assert results._digest_of(there) != results._digest_of(here)
 
 
 # ------------------------------------------------------------------------------------- devices

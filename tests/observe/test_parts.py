@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import multiprocessing
 import os
@@ -15,7 +16,7 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
-from jaxclamp.core.records import concrete_subclasses
+from jaxclamp.core.records import concrete_subclasses, withdraw
 from jaxclamp.scenes.files import loads_scene
 from jaxclamp.sensitivity.worker import call_elsewhere
 from optimize.study_file import load_study
@@ -109,7 +110,6 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     yield tmp_path
     for name in [n for n in sys.modules if n.startswith(("parts_", "others_"))]:
-        from jaxclamp.core.records import withdraw
         from jaxclamp.observe.parts import _imported
 
         for part in vars(_imported.pop(name)).values():
@@ -293,6 +293,16 @@ BAD = {
         PARTS.replace('law: str = jc.static("soft")', "kind: int = jc.static(1)"),
         'others.py: law Soft has no name: expected a field law: str = static("...")',
     ),
+    "no shear modulus": (
+        PARTS.replace("c: jax.Array", "mu: jax.Array"),
+        "others.py: law Soft has no c: expected quantities c and bulk, its shear and bulk modulus",
+    ),
+    "no moduli": (
+        PARTS.replace('c: jax.Array = jc.quantity("kPa", 0.0, 1e6)', "c: int = jc.static(1)").replace(
+            "bulk: jax.Array", "k: jax.Array"
+        ),
+        "others.py: law Soft has no c and no bulk: expected quantities c and bulk",
+    ),
     "two targets": (
         PARTS.replace(
             "    height_left:", '    more: jax.Array = jc.quantity("mm", 0.0, 1.0)\n    height_left:'
@@ -323,6 +333,28 @@ def test_a_bad_file_is_one_sentence_and_leaves_nothing(folder, capsys, name):
     assert refused(capsys, "show", "human-lad", "--import", "others.py").startswith(said)
     assert concrete_subclasses(jc.Jaw) == before
     assert {n for n in set(sys.modules) - modules if n.startswith("others")} == set()
+
+
+def test_a_law_of_a_script_without_moduli_is_refused():
+    @jc.record
+    class Bare(jc.Material):
+        law: str = jc.static("bare")
+        c: jax.Array = jc.quantity("kPa", 0.0, 1e6)
+
+        def psi_bar(self, F):
+            return 0.5 * self.c * (sum(F[i, j] ** 2 for i in range(3) for j in range(3)) - 3.0)
+
+    said = r'artery.layers\[0\].material.law = "bare": expected a law with the quantities c and bulk$'
+    human = jc.load_scene("human-lad")
+    media = dataclasses.replace(human.artery.layers[0], material=Bare(c=20.0))
+    artery = dataclasses.replace(human.artery, layers=(media, human.artery.layers[1]))
+    try:
+        with pytest.raises(jc.SceneError, match=said):
+            jc.load_scene("human-lad", ["artery.layers[0].material={law='bare', c_kPa=20.0}"])
+        with pytest.raises(jc.SceneError, match=said):
+            jc.clamp(dataclasses.replace(human, artery=artery))
+    finally:
+        withdraw(Bare)
 
 
 def test_two_files_with_a_name_in_common(folder, capsys):

@@ -18,6 +18,7 @@ from optimize.resuming import take_over
 from optimize.starts import Budget, answer, from_another_start
 from optimize.study_file import StudyFile, load_study
 
+CODE = jc.versions()["jaxclamp"].partition("+")[0]
 STUDY = """
 scene = "human-lad"
 set = ["mesh.circumferential=6", "mesh.axial=16", "mesh.radial=[2, 1]"]
@@ -203,6 +204,7 @@ def test_a_lost_process_of_another_start_is_one_sentence():
     ("versions", "said"),
     [
         ({"jaxclamp": "0.0.9"}, "made by jaxclamp 0.0.9; this is jaxclamp "),
+        ({"jaxclamp": f"{CODE}+0123abcd"}, f"made by jaxclamp {CODE}+0123abcd; this is jaxclamp {CODE}+"),
         ({"jax": "0.1", "numpy": "1.0"}, "made by jax 0.1, numpy 1.0; this is jax "),
         ({"numpy": 3}, "made by numpy of an unknown version; this is numpy "),
         ({"jax": "x" * 100_000}, "made by jax xxx"),

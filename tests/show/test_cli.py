@@ -98,7 +98,7 @@ class Engine:
         folder.mkdir(parents=True, exist_ok=True)
         names = ("result.json", "figure.png", "report.html")
         for name in names:
-            (folder / name).write_text(json.dumps({"converged": result.converged}))
+            (folder / name).write_text(json.dumps({"converged": result.converged, "versions": {}}))
         return [folder / name for name in names]
 
 
@@ -407,6 +407,31 @@ def test_wrong_input_is_one_sentence_exit_2_and_nothing_written(engine, capsys, 
     assert engine.scenes == [], "nothing is solved"
     assert everything_below(tmp_path) == ["file"]
     assert (tmp_path / "file").read_text() == "precious"
+
+
+SCENE = "# my notes\nartery = 'human-lad-wall'\nclamp.jaw = 'cylinder-3mm'\nstop.occlusion = 0.5\n"
+
+
+@pytest.mark.parametrize("name", ["README.md", "result.json", "jaw.csv", "figures/sections.svg"])
+def test_files_of_a_user_are_not_replaced(engine, capsys, tmp_path, name):
+    """The scene itself never; others if no result of an earlier run is there."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    other = tmp_path / "other"
+    (other / name).parent.mkdir(parents=True)
+    (other / name).write_text("mine")
+    here, there = (call(capsys, "run", "scene.toml", "--out", out) for out in (".", "other"))
+    assert engine.scenes == [], "nothing is solved"
+    assert here[:2] == there[:2] == (2, "")
+    assert "scene.toml, the scene itself, would be replaced in '.': take another folder" in here[2]
+    assert f"{name}, which is not of a run of jaxclamp" in there[2]
+    assert len(here[2].splitlines()) == len(there[2].splitlines()) == 1
+    assert everything_below(tmp_path) == sorted(
+        {"scene.toml", "other", f"other/{name}", *(["other/figures"] if "/" in name else [])}
+    )
+    (other / "result.json").write_text('{"converged": false, "versions": {}}')
+    assert call(capsys, "run", "scene.toml", "--out", "other")[0] == 0
+    assert call(capsys, "run", "scene.toml", "--out", ".")[0] == 2
+    assert (tmp_path / "scene.toml").read_text() == SCENE
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root and Windows may write anywhere")

@@ -13,11 +13,13 @@ import pytest
 from test_outputs import COARSE
 
 import jaxclamp as jc
+from jaxclamp.core.parts import own_parts
 from jaxclamp.core.records import record
 from jaxclamp.physics.jaws import Cylinder
 from jaxclamp.scenes import schema
 from jaxclamp.show import jaw as jaw_files
 from jaxclamp.show.readme import about
+from jaxclamp.trust.estimates import SOURCES
 
 meshio = pytest.importorskip("meshio")
 
@@ -185,6 +187,31 @@ def test_every_field_is_explained_and_no_other(folder):
         for name in re.findall("`(.*?)`", names):
             data = mesh.point_data if where == "points" else mesh.cell_data
             assert any(each == name or name == "layer_NAME" for each in data), row
+
+
+def keys(text: str) -> list[str]:
+    """What stands between backticks."""
+    return re.findall("`(.*?)`", text)
+
+
+def test_every_key_of_the_result_is_explained_and_no_other(folder, result):
+    content = json.loads((folder / "result.json").read_text())
+    whole, record = (
+        about().split("## What result.json holds")[1].split("## Fields")[0].split("A record holds")
+    )
+    rows = {keys(row)[0]: keys(row)[1:] for row in whole.splitlines() if row.startswith("| `")}
+    assert list(rows) == list(content)
+    for key in ("load_free", "physiological", "model", "solver", "cost"):
+        assert rows[key] == list(content[key]), key
+    assert result.errors is None
+    assert rows["errors"] == ["value", "error", *SOURCES]
+    assert rows["own_parts"] == [*own_parts(Spot(radius=1.0))[0]]
+    assert all(name in whole for name in content["versions"])
+    names = [
+        name for row in record.splitlines() if row.startswith("| `") for name in keys(row.split(" | ")[0])
+    ]
+    final = {f"{n}.LAYER" if isinstance(v, dict) else n for n, v in content["final"].items()}
+    assert sorted(names) == sorted(final)
 
 
 def test_the_page_of_the_docs_says_the_same():

@@ -625,6 +625,15 @@ def test_an_earlier_result_with_more_states_is_replaced_as_a_whole(result, folde
     assert len(list(tmp_path.glob("figures/*.png"))) == 1 + 1
 
 
+def test_files_of_others_stay_where_no_earlier_result_is(result, tmp_path):
+    for name in ("scene.toml", "README.md", "jaw.stl"):
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(FileExistsError, match=f"{name}, which is not of a run of jaxclamp"):
+            export.write_outputs(result, tmp_path)
+        assert snapshot(tmp_path) == {name: b"mine"}
+        (tmp_path / name).unlink()
+
+
 def test_a_file_in_place_of_the_folder_is_refused(result, tmp_path):
     (tmp_path / "taken").write_text("mine")
     with pytest.raises(OSError, match="taken"):

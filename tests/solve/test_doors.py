@@ -9,14 +9,17 @@ import threading
 from concurrent.futures import ProcessPoolExecutor
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxclamp as jc
 from jaxclamp.core import failures
 from jaxclamp.core.records import quantity, record, static
-from jaxclamp.physics.jaws import Jaw
+from jaxclamp.physics.jaws import Cylinder, Jaw
 from jaxclamp.scenes.files import require_computable
+from jaxclamp.scenes.presets import presets
+from jaxclamp.solve import gaps
 from jaxclamp.solve.clamping import inflate
 
 SMALL = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[1, 1]", "stop.occlusion=0.6"]
@@ -147,6 +150,80 @@ class Upside(Jaw):
 
     def curvatures(self):
         return np.ones(1)
+
+
+@record
+class Doubled(Cylinder):
+    """A bar whose gap is twice the distance."""
+
+    shape: str = static("doubled")
+
+    def gap(self, point):
+        return 2.0 * super().gap(point)
+
+
+@record
+class Undefined(Cylinder):
+    """A bar whose gap is undefined to the sides of its middle."""
+
+    shape: str = static("undefined")
+
+    def gap(self, point):
+        return jnp.where(jnp.abs(point[2]) > 1.0, jnp.nan, super().gap(point))
+
+
+@record
+class Kinked(Cylinder):
+    """A bar whose gap has no derivative to the sides of its middle."""
+
+    shape: str = static("kinked")
+
+    def gap(self, point):
+        return super().gap(point) + jnp.where(point[2] > 1.0, jnp.sqrt(0.0 * point[2]), 0.0)
+
+
+@record
+class Tilted(Cylinder):
+    """A bar that is lower to one side of the artery, where its gap is no distance."""
+
+    shape: str = static("tilted")
+
+    def gap(self, point):
+        return super().gap(point) + jnp.maximum(point[0] - 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("jaw", "said"),
+    [
+        (Doubled, "of length 1 there; it is .* mm with one of 2 at x = 0, y = 2.06, z = -2.85 mm$"),
+        (Undefined, "it is nan mm with one of nan at x = 0, y = 0, z = -2.85 mm$"),
+        (Kinked, "it is .* mm with one of nan at x = 0, y = .*, z = 1.05 mm$"),
+        (Tilted, "it is .* mm with one of 1.41 at x = 3.73, y = "),
+    ],
+)
+def test_a_gap_that_is_no_distance_is_named(jaw, said):
+    with pytest.raises(jc.SceneError, match=rf"clamp\.jaw of shape '{jaw.__name__.lower()}': .*{said}"):
+        jc.clamp(jc.replace(small(), "clamp.jaw", jaw(radius=3.0)))
+
+
+JAWS = (
+    *(each.name for each in presets("jaw")),
+    "{ shape = 'flat', half_width_mm = 1.0, edge_radius_mm = 0.02 }",
+    "{ shape = 'flat', half_width_mm = 0.02, edge_radius_mm = 3.0 }",
+    "{ shape = 'spline', half_width_mm = 2.0, slopes = [0.0, 0.2, 0.3, 0.3], edge_radius_mm = 0.5 }",
+    "{ shape = 'spline', half_width_mm = 2.0, slopes = [0.5, -0.3, 0.6, -0.2, 0.4], edge_radius_mm = 0.3 }",
+    "{ shape = 'spline', half_width_mm = 2.0, slopes = [-0.1, 2.0, 9.0, 20.0], edge_radius_mm = 0.1 }",
+)
+
+
+@pytest.mark.parametrize("jaw", JAWS)
+def test_faces_that_ship_are_seen_and_have_a_distance(jaw):
+    """Most of the points that are looked at are on the face."""
+    scene = small(f"clamp.jaw={jaw}")
+    gaps.require_a_gap(scene)
+    z = jnp.asarray(float(scene.clamp.jaw.half_extent()) * gaps.ALONG)
+    gap = np.asarray(gaps._face(scene.clamp.jaw, jnp.zeros_like(z), z)[1])
+    assert np.mean(np.abs(gap) < 1e-9) >= 0.9
 
 
 def test_a_jaw_turned_inside_out_is_named():

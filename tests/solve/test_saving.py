@@ -7,6 +7,7 @@ import io
 import json
 import struct
 
+import cloudpickle
 import h5py
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxclamp as jc
-from jaxclamp.core.records import record
+from jaxclamp.core.records import record, withdraw
 from jaxclamp.physics.jaws import Cylinder, Jaw
 from jaxclamp.pictures.plots import figures, png
 from jaxclamp.potential.model import build_model
@@ -105,6 +106,10 @@ def test_a_failure_comes_back_with_its_sentence_and_what_converged(tmp_path):
     assert not again.converged
     assert str(again.failure) == str(caught.value)
     assert again.failure.result is again
+    travelled = cloudpickle.loads(cloudpickle.dumps(caught.value))
+    assert (str(travelled), travelled.result) == (str(caught.value), None)
+    assert travelled.history == again.history
+    assert [record["stage"] for record in travelled.history][:2] == ["physiological", "clamping"]
     assert again.to_dict() == caught.value.result.to_dict()
     with pytest.raises(jc.EquilibriumError, match="no equilibrium in stage 'clamping'"):
         again.measure(jc.clamp_force())
@@ -138,8 +143,46 @@ def test_a_jaw_of_ones_own_is_known_once_it_is_imported(small, tmp_path, monkeyp
     )
     assert jc.load_result(path).scene == scene
     monkeypatch.setattr(loading, "loads_scene", _without(Bar, loading.loads_scene))
-    with pytest.raises(jc.SceneError, match=r"jaw.shape = \"bar of a user\".*are known once imported\)$"):
+    with pytest.raises(
+        jc.SceneError, match=r"jaw.shape = \"bar of a user\".*\(made with 'Bar' of .*known once imported\)$"
+    ):
         jc.load_result(path)
+
+
+OWN = """
+import jaxclamp as jc
+from jaxclamp.physics.jaws import Cylinder
+
+@jc.record
+class Bar(Cylinder):
+    shape: str = jc.static("bar of a file")
+
+    def half_extent(self):
+        return 1.0 * self.radius
+"""
+
+
+def test_a_part_that_was_edited_is_refused(small, tmp_path):
+    """Its states are of the part as it was. A file that has only moved is the same."""
+    file, moved = tmp_path / "saved_parts.py", tmp_path / "saved_parts_moved.py"
+    file.write_text(OWN)
+    first = jc.import_parts(file)
+    scene = jc.replace(small.scene, "clamp.jaw", first.Bar(radius=3.0))
+    model = dataclasses.replace(small.model, scene=scene)
+    states = tuple(dataclasses.replace(kept, model=model) for kept in small.states)
+    path = dataclasses.replace(small, model=model, states=states).save(tmp_path / "r")
+    assert jc.load_result(path).scene == scene
+    file.write_text(OWN.replace("1.0 *", "0.5 *"))
+    second = jc.import_parts(file)
+    said = refused(path)
+    assert "found 'Bar' of " in said
+    assert said.endswith(": import their file as it was then, or clamp the scene again")
+    withdraw(second.Bar)
+    moved.write_text(OWN)
+    third = jc.import_parts(moved)
+    assert type(jc.load_result(path).scene.clamp.jaw) is third.Bar
+    withdraw(third.Bar)
+    assert "which is known once imported)" in refused(path)
 
 
 def _without(jaw, loads_scene):
@@ -199,7 +242,7 @@ def test_another_version_is_named(saved, tmp_path):
         other.write_bytes(dataclasses.replace(header, **changed).to_bytes() + content[HEADER:])
         assert "saved by jaxclamp" in refused(other)
         assert "clamp its scene again" in refused(other)
-    patch = ".".join([*header.version.split(".")[:2], "99"])
+    patch = ".".join([*header.version.split(".")[:2], "99+0123abcd"])
     other.write_bytes(dataclasses.replace(header, version=patch).to_bytes() + content[HEADER:])
     assert jc.load_result(other).converged
 
@@ -240,6 +283,10 @@ FORGERIES = {
     ),
     "data of another file": lambda f: _put(
         f["states/0/state"], "x", shape=(4,), dtype="f8", external=[("/etc/hostname", 0, 32)]
+    ),
+    "no list of own parts": lambda f: _put(f["scenes/0"], "own_parts", data="[1]"),
+    "a part of a stranger": lambda f: _put(
+        f["scenes/0"], "own_parts", data=json.dumps([{"part": "\n" * 999, "from": "\a", "sha256": "\a"}])
     ),
     "a circle": lambda f: _relink(f["states/0"], "lin", f["states"]),
     "terabytes of nothing": lambda f: _put(f["states/0/state"], "x", shape=(10**12, 3), dtype="f8"),
