@@ -125,6 +125,14 @@ def test_a_point_that_is_beaten_within_its_error_is_said_so(tmp_path, errors, wo
     assert any(np.ptp(end) == pytest.approx(2.0 * errors["point-3"]) for end in ends)
 
 
+def test_a_front_whose_points_are_all_beaten_keeps_its_numbers(tmp_path):
+    """No curve is drawn; it used to be the word "-", which turned the heights of the axis into categories."""
+    axes = plot_front(front_of(tmp_path, ROWS | {"reference": (0.5, 0.5)}, {})).axes[0]
+    assert not axes.yaxis.have_units()
+    low, high = axes.get_ylim()
+    assert low < 0.5 < 5.0 < high
+
+
 @pytest.mark.slow
 def test_a_front_is_swept_resumed_and_drawn(tmp_path, capsys):
     out, path = tmp_path / "out", written(tmp_path)
