@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxclamp import (
-    EquilibriumError,
     Estimate,
+    Failure,
     Measure,
     Progress,
     Result,
@@ -193,8 +193,8 @@ def front(
         bounded, reference = with_bounds(problem, tell)
         points = _Searches(bounded, second, budget, folder, resume, tell).points(count)
         if reference is None and problem.reference is not None:
-            reference = _clamped(problem.reference)
-        others = {"start": _clamped(problem.scene), "reference": reference}
+            reference = _clamped(problem.reference, "reference", tell)
+        others = {"start": _clamped(problem.scene, "start", tell), "reference": reference}
         asked = {p.folder: p.result for p in points}
         asked |= {name: result for name, result in others.items() if result is not None}
         tell(Progress("errors", 0.0, "how far both objectives of each point may be off"))
@@ -207,11 +207,12 @@ def front(
         journal.close()
 
 
-def _clamped(scene: Any) -> Result | None:
-    """The scene's solution; None if it has none."""
+def _clamped(scene: Any, name: str, tell: Callable[[Progress], Any]) -> Result | None:
+    """The scene's solution; None, said in one sentence, if it has none: the front stands without it."""
     try:
         return clamp(scene)
-    except EquilibriumError:
+    except Failure as error:
+        tell(Progress("errors", 0.0, f"no {name}: {error}"))
         return None
 
 

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import types
 
+import numpy as np
 import pytest
 
 import jaxclamp as jc
 from optimize.gains import Gain
+from optimize.record import Evaluation, Record
+from optimize.study import solved_cold
+from optimize.study_file import load_study
 from optimize.verification import Verification, verify
 
 
@@ -55,7 +59,10 @@ def test_a_finer_model_without_equilibrium_has_no_gain():
     assert (said["gain"], said["gain_difference"], said["survives"]) == (None, None, False)
 
 
-@pytest.mark.parametrize("error", [jc.TooLittleMemory("it needs 9 GB"), jc.SceneError("it is too stiff")])
+FAILURES = [jc.TooLittleMemory("it needs 9 GB"), jc.SceneError("it is too stiff"), jc.Unfit("no device")]
+
+
+@pytest.mark.parametrize("error", FAILURES)
 def test_a_finer_model_that_cannot_be_solved_leaves_the_study(error, monkeypatch):
     """Stand-ins for results: each has a scene and a value."""
 
@@ -67,6 +74,24 @@ def test_a_finer_model_that_cannot_be_solved_leaves_the_study(error, monkeypatch
     problem = types.SimpleNamespace(objective=jc.clamp_force())
     found = verify(problem, {"start": result, "best": result})
     assert found.sentence == f"the finer model was not solved: best: {error}"
+
+
+@pytest.mark.parametrize("error", FAILURES)
+def test_a_reference_that_cannot_be_solved_leaves_the_study(error, monkeypatch):
+    """Beside it, the best is the start here, whose solution is at hand."""
+
+    def clamp(scene):
+        raise error
+
+    monkeypatch.setattr("optimize.study.clamp", clamp)
+    record = Record(load_study("human-lad-jaw").problem, "slsqp", [])
+    record.evaluations.append(
+        Evaluation(record.problem.start, np.full(len(record.problem.measures), 3.0), np.ones((1, 1)), 9)
+    )
+    start, told = types.SimpleNamespace(), []
+    best, result, reference = solved_cold(record, start, None, told.append)
+    assert (best, result, reference) == (record.evaluations[0], start, None)
+    assert [event.message for event in told] == [f"no reference: {error}"]
 
 
 @pytest.mark.parametrize(
