@@ -160,7 +160,10 @@ def minimise(
             if others:
                 tell(Progress("optimising", 1.0, f"waiting for {len(others)} other starts"))
             for number, other in enumerate(others, 2):
-                record.evaluations += [dataclasses.replace(e, start=number) for e in answer(other)]
+                found, told = answer(other)
+                for event in told:
+                    tell(event)
+                record.evaluations += [dataclasses.replace(e, start=number) for e in found]
         study = finish(record, first, reference, stopped, tell, check_finer_mesh, begun)
         if journal is not None:
             journal.write(study.to_dict(), record.rows())
