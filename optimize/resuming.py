@@ -58,6 +58,20 @@ def take_over(record: Record, journal: Journal | None, tell: Callable[[Progress]
         tell(Progress("optimising", 0.0, f"the study in {journal.folder} was {said}"))
 
 
+def asked_before(found: Any, n_variables: int) -> tuple[np.ndarray, float | None] | None:
+    """Start design (n_variables,), file units, and upper bound of the first constraint of an earlier run.
+
+    found: the content of its journal. The bound is None if it is infinite.
+
+    Returns None if one of them is not there.
+    """
+    try:
+        start = _numbers(found["design"]["start"], "start", n_variables, True)
+        return start, finite(found["constraints"][0]["upper"])
+    except (_Damaged, LookupError, TypeError):
+        return None
+
+
 def other_versions(found: Any) -> str | None:
     """What to say of a study made by these versions; None if they are those of this process.
 
