@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import types
 
 import numpy as np
 import pytest
 
 import jaxclamp as jc
+from jaxclamp.show.report import STYLE
 from optimize.gains import Gain
 from optimize.record import Evaluation, Record
 from optimize.study import solved_cold
@@ -106,3 +108,14 @@ def test_a_reference_that_cannot_be_solved_leaves_the_study(error, monkeypatch):
 )
 def test_the_opening_boxes_of_a_report(gain, card):
     assert gain.card("the start") == card
+
+
+def test_a_long_number_stays_inside_its_box():
+    """A box may be narrower than its words and breaks them anywhere; the number does not forbid that."""
+    rules = {
+        selector.strip(): dict(pair.split(":") for pair in re.sub(r"\s", "", body).split(";") if ":" in pair)
+        for selector, body in re.findall(r"([^{}]+){([^{}]*)}", STYLE)
+    }
+    box, big = rules[".headlines div"], rules[".headlines b"]
+    assert (box["min-width"], box["overflow-wrap"]) == ("0", "anywhere")
+    assert not {"white-space", "overflow-wrap", "word-break", "width", "min-width"} & set(big)
