@@ -2,13 +2,13 @@
 
 The ends are the designs of least first and of least second objective. In between the first is minimised
 under limits on the second, evenly spread between its values at the ends (epsilon-constraints). Every point
-is a search of its own with its own journal, begun at the best design that the searches before it have met,
-and solved from the nearest of theirs.
+is a search of its own with its own journal, begun at the best design that the searches before it have met.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxclamp import (
-    EquilibriumError,
     Estimate,
+    Failure,
     Measure,
     Progress,
     Result,
@@ -30,9 +30,9 @@ from jaxclamp import (
 from optimize.gains import with_error
 from optimize.journal import Journal
 from optimize.named_measures import in_words
-from optimize.problem import Constraint, DesignProblem
+from optimize.problem import Constraint, DesignProblem, rounded
 from optimize.record import FEASIBLE, Evaluation, Record
-from optimize.resuming import take_over
+from optimize.resuming import asked_before, take_over
 from optimize.starts import Budget, drive
 from optimize.study import compare, found_cold, require_solvable, with_bounds
 
@@ -191,10 +191,10 @@ def front(
         if journal.found is not None and "front" not in journal.found:
             raise SceneError(f"{journal.path}: the study in that folder is another one, of one objective")
         bounded, reference = with_bounds(problem, tell)
-        points = _Searches(bounded, second, budget, folder, resume, tell).points(count)
+        points = Searches(bounded, second, budget, folder, resume, tell).points(count)
         if reference is None and problem.reference is not None:
-            reference = _clamped(problem.reference)
-        others = {"start": _clamped(problem.scene), "reference": reference}
+            reference = _clamped(problem.reference, "reference", tell)
+        others = {"start": _clamped(problem.scene, "start", tell), "reference": reference}
         asked = {p.folder: p.result for p in points}
         asked |= {name: result for name, result in others.items() if result is not None}
         tell(Progress("errors", 0.0, "how far both objectives of each point may be off"))
@@ -207,15 +207,16 @@ def front(
         journal.close()
 
 
-def _clamped(scene: Any) -> Result | None:
-    """The scene's solution; None if it has none."""
+def _clamped(scene: Any, name: str, tell: Callable[[Progress], Any]) -> Result | None:
+    """The scene's solution; None, said in one sentence, if it has none: the front stands without it."""
     try:
         return clamp(scene)
-    except EquilibriumError:
+    except Failure as error:
+        tell(Progress("errors", 0.0, f"no {name}: {error}"))
         return None
 
 
-class _Searches:
+class Searches:
     """The searches of a front, each begun at the best design known by then."""
 
     def __init__(
@@ -231,31 +232,25 @@ class _Searches:
         self.resume, self.tell = resume, tell
         self.known: list[Evaluation] = []
         """of all searches; values: first and second objective, then what is constrained"""
-        self.solved: list[tuple[np.ndarray, Result]] = []
-        """the designs of the points, and their solutions"""
 
     def points(self, count: int) -> tuple[Point, ...]:
         """From the least first objective to the least second one."""
         begin, end = self._point(1, None), self._point(count, None, swapped=True)
         first, last = (point.result.measure(self.second) for point in (begin, end))
-        limits = np.linspace(first, last, count)[1:-1].tolist()
+        limits = [rounded(limit) for limit in np.linspace(first, last, count)[1:-1].tolist()]
         between = [self._point(number, limit) for number, limit in enumerate(limits, 2)]
         return (begin, *between, end)
 
     def _point(self, number: int, limit: float | None, swapped: bool = False) -> Point:
         """The best design in the first objective for a limit on the second; swapped: in the second."""
         name = f"point-{number}"
-        problem = limited(self.problem, self.second, limit, swapped)
-        self.tell(Progress(name, 0.0, f"minimising the {in_words(problem.objective)}"))
-        begin = Record(problem, self.budget.method, [_swapped(e, swapped) for e in self.known]).best()
-        near = None
-        if begin is not None:
-            problem = dataclasses.replace(problem, scene=problem.scene_at(begin.design))
-            near = min(self.solved, key=lambda known: float(np.max(np.abs(known[0] - begin.design))))
-        record = Record(problem, self.budget.method, [])
-        journal = Journal(self.folder / name, self.resume)
+        objective = self.second if swapped else self.problem.objective
+        self.tell(Progress(name, 0.0, f"minimising the {in_words(objective)}"))
         heard = lambda event: self.tell(dataclasses.replace(event, stage=name))  # noqa: E731
+        journal = Journal(self.folder / name, self.resume)
         try:
+            problem, near = self._begun(journal.found, limit, swapped)
+            record = Record(problem, self.budget.method, [])
             take_over(record, journal, heard)
             _, stopped = drive(record, self.budget, journal, heard, near)
             best, result = found_cold(record, None)
@@ -265,9 +260,36 @@ class _Searches:
             journal.close()
         self.tell(Progress(name, 1.0, stopped))
         self.known += [_swapped(e, swapped) for e in record.evaluations]
-        self.solved.append((best.design, result))
-        violation, count = best.violation(problem), len(record.evaluations)
-        return Point(name, limit, best.design, violation, result, count, stopped)
+        cold = dataclasses.replace(best, values=np.array([result.measure(m) for m in problem.measures]))
+        limit = problem.constraints[0].upper
+        return Point(
+            name,
+            limit if math.isfinite(limit) else None,
+            best.design,
+            cold.violation(problem),
+            result,
+            len(record.evaluations),
+            stopped,
+        )
+
+    def _begun(
+        self, found: dict[str, Any] | None, limit: float | None, swapped: bool
+    ) -> tuple[DesignProblem, tuple[np.ndarray, Result] | None]:
+        """The problem of a point from its start on, and a design there with its solution from scratch.
+
+        found: the journal of an earlier run, whose start and limit hold: those that follow from the other
+        points may have other last digits by now, or be better with a greater budget
+        """
+        before = asked_before(found, self.problem.start.size)
+        start, limit = (None, limit) if before is None else before
+        problem = limited(self.problem, self.second, limit, swapped)
+        if not self.known:
+            return problem, None
+        if start is not None:
+            return problem.begun_at(start * [entry.factor for entry in problem.entries]), None
+        known = Record(problem, self.budget.method, [_swapped(e, swapped) for e in self.known])
+        best, result = found_cold(known, None)
+        return problem.begun_at(best.design), (best.design, result)
 
 
 def _swapped(e: Evaluation, swapped: bool) -> Evaluation:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp import Progress, dump_scene
+from jaxclamp import Progress
 from jaxclamp.pictures.plots import Plate, png, svg
 from jaxclamp.pictures.plots.style import AXIAL, FAINT, INK, NORMAL, Picture, dress, legend
 from jaxclamp.show.export import write_outputs
@@ -28,7 +28,6 @@ def write_front(
     for number_, point in enumerate(found.points):
         tell(Progress("writing", number_ / len(found.points), point.folder))
         write_outputs(point.result, folder / point.folder / "best")
-        write_whole(folder / point.folder / "best" / "scene.toml", dump_scene(point.result.scene))
     plates = []
     for plate in plates_of(found):
         plates.append((plate, png(plate.figure)))
@@ -63,7 +62,8 @@ def plot_front(found: Front) -> Picture:
     figure = Picture(6.4, 4.2)
     axes = figure.add_subplot()
     on = [[e.value for e in found.values(p.folder)] for p in found.points if not found.standing(p.folder)]
-    axes.plot(*np.transpose(on), "-", color=AXIAL, linewidth=1.4)
+    if on:
+        axes.plot(*np.transpose(on), "-", color=AXIAL, linewidth=1.4)
     for name in found.estimates:
         x, y = found.values(name)
         beside = name in found.others

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import os
 from contextlib import suppress
@@ -80,6 +81,14 @@ class Journal:
                 "move the file away or take another folder"
             )
         return found
+
+    def keep_copy(self) -> Path:
+        """Copy study.json to study.json.damaged, or with a number if there is one already. Raises OSError."""
+        numbers = itertools.chain([""], (f"-{number}" for number in itertools.count(2)))
+        names = (f"{STUDY}.damaged{number}" for number in numbers)
+        copy = next(path for name in names if not (path := self.folder / name).exists())
+        write_bytes(copy, self.path.read_bytes())
+        return copy
 
     def write(self, content: dict[str, Any], rows: list[dict[str, Any]]) -> None:
         """Rewrite study.json and bring iterations.csv up to its rows. Raises OSError."""

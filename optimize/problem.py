@@ -106,6 +106,15 @@ class DesignProblem:
         """The scene with a design, (n_variables,), internal units."""
         return with_design(self.scene, self.paths, np.asarray(design, float))
 
+    def begun_at(self, design: np.ndarray) -> DesignProblem:
+        """The problem with another start, (n_variables,), internal units.
+
+        It is rounded to `DIGITS` in the units of the scene file, so that a journal says all of it.
+        """
+        factors = np.array([entry.factor for entry in self.entries])
+        start = np.array([rounded(value) for value in design / factors]) * factors
+        return dataclasses.replace(self, scene=self.scene_at(np.clip(start, *self.bounds)))
+
     @property
     def is_relative(self) -> bool:
         """True if a bound is relative to the reference, so that this has to be solved first."""
@@ -122,7 +131,12 @@ class DesignProblem:
 
 
 DIGITS = 6
-"""of a bound that is taken from the reference's solution"""
+"""of a bound or a start that is taken from a solution"""
+
+
+def rounded(value: float) -> float:
+    """The value with `DIGITS` digits."""
+    return float(f"{value:.{DIGITS}g}")
 
 
 def _absolute(c: Constraint, reference: Result) -> Constraint:
@@ -130,7 +144,7 @@ def _absolute(c: Constraint, reference: Result) -> Constraint:
     if not c.relative:
         return c
     value = reference.measure(c.measure)
-    bound = lambda side: float(f"{side * value:.{DIGITS}g}") if math.isfinite(side) else side  # noqa: E731
+    bound = lambda side: rounded(side * value) if math.isfinite(side) else side  # noqa: E731
     return Constraint(c.measure, bound(c.lower), bound(c.upper))
 
 

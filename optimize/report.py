@@ -39,7 +39,6 @@ def write_study(
     for name, result in (("start", study.start), ("best", study.best)):
         tell(Progress("writing", 0.2 if name == "start" else 0.5, f"{name} design"))
         write_outputs(result, folder / name)
-        write_whole(folder / name / "scene.toml", dump_scene(result.scene))
     plates: list[tuple[Plate, bytes]] = []
     (folder / "figures").mkdir(exist_ok=True)
     for plate in figures(study):

@@ -1,7 +1,8 @@
 """Go on from the study.json of an earlier run, which may be damaged or of another version.
 
-Nothing that stands in it is trusted before it was looked at: whatever is wrong ends as a `SceneError`, one
-sentence with the file, what is wrong, how many rows are sound, and what to do.
+Nothing that stands in it is trusted before it was looked at. The study goes on with the rows before the
+first damaged one, and says so; if there is none, it ends as a `SceneError`, one sentence with the file, what
+is wrong and what to do.
 """
 
 from __future__ import annotations
@@ -32,8 +33,9 @@ class _Damaged(Exception):
 def take_over(record: Record, journal: Journal | None, tell: Callable[[Progress], Any]) -> None:
     """Add the evaluations that a journal holds and that were reached from the problem's own start.
 
-    tell: hears, once, that the journal was made by other versions. Raises SceneError for a journal that is
-    damaged or of another study.
+    tell: hears, once each, that rows are damaged and that the journal was made by other versions. A damaged
+    file is copied before it is brought back to its sound rows. Raises SceneError for a journal of another
+    study or without a sound row, OSError if the folder cannot be written.
     """
     if journal is None or journal.found is None:
         return
@@ -44,10 +46,30 @@ def take_over(record: Record, journal: Journal | None, tell: Callable[[Progress]
         raise SceneError(
             f"{path}: the study in that folder is another one: scene, variables, own parts or method differ"
         )
-    record.evaluations += _evaluations(found.get("iterations"), record, path)
+    own, wrong = _evaluations(found.get("iterations"), record, path)
+    record.evaluations += own
+    if wrong is not None:
+        copy = journal.keep_copy()
+        journal.write(record.to_dict(), record.rows())
+        going_on = f"going on with the rows before it, the damaged file is kept as {copy.name}"
+        tell(Progress("optimising", 0.0, f"{path}: {wrong}; {going_on}"))
     said = other_versions(found.get("versions"))
     if said is not None:
         tell(Progress("optimising", 0.0, f"the study in {journal.folder} was {said}"))
+
+
+def asked_before(found: Any, n_variables: int) -> tuple[np.ndarray, float | None] | None:
+    """Start design (n_variables,), file units, and upper bound of the first constraint of an earlier run.
+
+    found: the content of its journal. The bound is None if it is infinite.
+
+    Returns None if one of them is not there.
+    """
+    try:
+        start = _numbers(found["design"]["start"], "start", n_variables, True)
+        return start, finite(found["constraints"][0]["upper"])
+    except (_Damaged, LookupError, TypeError):
+        return None
 
 
 def other_versions(found: Any) -> str | None:
@@ -70,24 +92,27 @@ def _version(found: Any) -> str:
     return shortened(found) if good else "of an unknown version"
 
 
-def _evaluations(rows: Any, record: Record, path: Path) -> list[Evaluation]:
-    """The evaluations of the problem's own start. Raises SceneError unless every row is sound."""
+def _evaluations(rows: Any, record: Record, path: Path) -> tuple[list[Evaluation], str | None]:
+    """The evaluations of the problem's own start before the first damaged row, and what is wrong with that.
+
+    Raises SceneError if there is a damaged row and none before it.
+    """
     if not isinstance(rows, list):
         raise SceneError(f"{path}: damaged, its iterations are missing or are no list; {WAY_OUT}")
     found: list[Evaluation] = []
-    wrong: list[str] = []
+    wrong = None
     for number, row in enumerate(rows, 1):
         try:
             found.append(_evaluation(row, record))
         except _Damaged as damage:
-            wrong.append(f"row {number} of its iterations {damage}")
+            wrong = f"row {number} of its iterations {damage}"
+            break
     own = [e for e in found if e.start == 1]
-    if not wrong and own and not _is_start(own[0], record):
-        wrong.append("row 1 of its iterations is not the start design")
-    if wrong:
-        sound = f"{len(found)} of {len(rows)} rows are sound"
-        raise SceneError(f"{path}: damaged, {wrong[0]} ({sound}); {WAY_OUT}")
-    return own
+    if own and not _is_start(own[0], record):
+        own, wrong = [], "row 1 of its iterations is not the start design"
+    if wrong is not None and not own:
+        raise SceneError(f"{path}: damaged, {wrong}, so that nothing is left to go on with; {WAY_OUT}")
+    return own, wrong
 
 
 def _is_start(evaluation: Evaluation, record: Record) -> bool:

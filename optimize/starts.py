@@ -39,6 +39,10 @@ MOST_DRAWS = 64
 """rounds of eight draws in which other starts that make sense are looked for"""
 
 
+Found = tuple[list[Evaluation], list[Progress]]
+"""evaluations from another start, and what is to be told of the journal that they are partly from"""
+
+
 @dataclasses.dataclass(frozen=True)
 class Budget:
     """How a driver is to work, and how long."""
@@ -114,7 +118,7 @@ def at_once(others: int) -> int:
 @contextmanager
 def elsewhere(
     problem: DesignProblem, budget: Budget, count: int, folder: Path | None, resume: bool
-) -> Iterator[list[Future[list[Evaluation]]]]:
+) -> Iterator[list[Future[Found]]]:
     """Studies from `count` other starts in processes of their own; waited for if the block fails.
 
     folder: the journals are kept in its subfolders start-2, start-3 and so on; None: nowhere
@@ -140,7 +144,7 @@ def elsewhere(
         pool.shutdown(cancel_futures=True)
 
 
-def answer(other: Future[list[Evaluation]]) -> list[Evaluation]:
+def answer(other: Future[Found]) -> Found:
     """What another start found. Raises WorkerLost if its process has ended."""
     try:
         return other.result()
@@ -151,22 +155,21 @@ def answer(other: Future[list[Evaluation]]) -> list[Evaluation]:
         ) from None
 
 
-def from_another_start(
-    problem: DesignProblem, budget: Budget, folder: Path | None, resume: bool
-) -> list[Evaluation]:
+def from_another_start(problem: DesignProblem, budget: Budget, folder: Path | None, resume: bool) -> Found:
     """The evaluations of a study of its own from the problem's scene; none if that has no equilibrium.
 
-    Raises SceneError for a journal that is damaged or of another study, OSError if its folder cannot be
+    Raises SceneError for a journal of another study or without a sound row, OSError if its folder cannot be
     written.
     """
     record = Record(problem, budget.method, [])
+    told: list[Progress] = []
     journal = None if folder is None else Journal(folder, resume)
     try:
-        take_over(record, journal, lambda event: None)
+        take_over(record, journal, told.append)
         with suppress(EquilibriumError, SceneError):  # a start without equilibrium leaves nothing to keep
             drive(record, budget, journal, lambda event: None)
-            return record.evaluations
-        return []
+            return record.evaluations, told
+        return [], told
     finally:
         if journal is not None:
             journal.close()

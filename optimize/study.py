@@ -18,6 +18,7 @@ import numpy as np
 
 from jaxclamp import (
     EquilibriumError,
+    Failure,
     Measure,
     Neighbours,
     Progress,
@@ -159,7 +160,10 @@ def minimise(
             if others:
                 tell(Progress("optimising", 1.0, f"waiting for {len(others)} other starts"))
             for number, other in enumerate(others, 2):
-                record.evaluations += [dataclasses.replace(e, start=number) for e in answer(other)]
+                found, told = answer(other)
+                for event in told:
+                    tell(event)
+                record.evaluations += [dataclasses.replace(e, start=number) for e in found]
         study = finish(record, first, reference, stopped, tell, check_finer_mesh, begun)
         if journal is not None:
             journal.write(study.to_dict(), record.rows())
@@ -214,7 +218,7 @@ def finish(
     """
     tell(Progress("verifying", 0.0, "start and best from scratch"))
     start = first or clamp(record.problem.scene)
-    best, result, reference = _solved_cold(record, start, reference, tell)
+    best, result, reference = solved_cold(record, start, reference, tell)
     tell(Progress("verifying", 0.2, "how far the figures and their differences may be off"))
     asked = {} if reference is None else {"reference": reference}
     asked |= {"start": start, "best": result}
@@ -258,7 +262,7 @@ def compare(
     return found, Compared(objective, estimates)
 
 
-def _solved_cold(
+def solved_cold(
     record: Record, start: Result, known: Result | None, tell: Callable[[Progress], Any]
 ) -> tuple[Evaluation, Result, Result | None]:
     """The best evaluation, its solution from scratch, and that of the reference, solved aside."""
@@ -268,7 +272,7 @@ def _solved_cold(
         best, result = found_cold(record, start)
         try:
             return best, result, known if aside is None else aside.result()
-        except EquilibriumError as error:  # the study stands without it
+        except Failure as error:  # the study stands without it
             tell(Progress("verifying", 0.2, f"no reference: {error}"))
             return best, result, None
 

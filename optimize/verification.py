@@ -5,17 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from jaxclamp import (
-    EquilibriumError,
-    Measure,
-    Result,
-    Scene,
-    SceneError,
-    TooLittleMemory,
-    clamp,
-    neighbours,
-    replace,
-)
+from jaxclamp import Failure, Measure, Result, Scene, clamp, neighbours, replace
 from optimize.gains import Gain
 from optimize.price import Compared
 from optimize.problem import DesignProblem
@@ -124,7 +114,7 @@ def verify(
     for name, result in results.items():
         try:
             found = clamp(finer(result.scene), guess=result)
-        except (EquilibriumError, SceneError, TooLittleMemory) as error:
+        except Failure as error:
             failure = f"{name}: {error}" if name in ("start", "best") else failure
             continue
         fine[name], final[name] = found.measure(problem.objective), found.final

@@ -27,8 +27,8 @@ class Pattern:
     indices: np.ndarray
     """column of each entry, (n_nonzeros,)"""
     places: dict[str, sp.csr_matrix] = dataclasses.field(default_factory=dict)
-    """by region: the entries of its matrices [a, b, pair, cell] summed into the tangent's values;
-    (n_nonzeros, number of entries), ones"""
+    """by region: the entries of its matrices [a, b, pair, cell], block by block, summed into the tangent's
+    values; (n_nonzeros, number of entries), ones"""
 
     @property
     def n(self) -> int:
@@ -78,7 +78,15 @@ def build_pattern(
     unknown = np.full(held.size, -1)
     unknown[free] = np.arange(len(free))
     n = len(free)
-    entries = {name: _keys(nodes, unknown, n) for name, (nodes, _) in regions.items()}
+    entries = {
+        name: np.concatenate(
+            [
+                _keys(nodes[:, first : first + size], size, unknown, n)
+                for first in range(0, nodes.shape[1], size)
+            ]
+        )
+        for name, (nodes, size) in regions.items()
+    }
     distinct, place = np.unique(np.concatenate(list(entries.values())), return_inverse=True)
     skipped = int(distinct[0] == -1)
     ends = np.cumsum([keys.size for keys in entries.values()])[:-1]
@@ -99,8 +107,11 @@ def _places(place: np.ndarray, n_nonzeros: int) -> sp.csr_matrix:
     return sp.csr_matrix((np.ones(len(kept)), (place[kept], kept)), shape=(n_nonzeros, len(place)))
 
 
-def _keys(nodes: np.ndarray, unknown: np.ndarray, n: int) -> np.ndarray:
-    """Row times n plus column of every matrix entry [a, b, pair, cell], -1 for what belongs nowhere."""
+def _keys(nodes: np.ndarray, size: int, unknown: np.ndarray, n: int) -> np.ndarray:
+    """Row times n plus column of every matrix entry [a, b, pair, cell] of a block, filled up to its size.
+
+    -1 for what belongs nowhere.
+    """
     rows = unknown[3 * nodes[:, None, None, :] + PAIRS[:, 0][:, None]]
     columns = unknown[3 * nodes[None, :, None, :] + PAIRS[:, 1][:, None]]
     rows, columns = np.broadcast_arrays(rows, columns)
@@ -108,4 +119,5 @@ def _keys(nodes: np.ndarray, unknown: np.ndarray, n: int) -> np.ndarray:
     local = np.arange(len(nodes))
     mirror = (local[:, None] > local[None])[:, :, None] & (PAIRS[:, 0] == PAIRS[:, 1])
     key[(rows < 0) | (columns < 0) | mirror[..., None]] = -1
-    return key.ravel()
+    filling = ((0, 0), (0, 0), (0, 0), (0, size - nodes.shape[1]))
+    return np.pad(key, filling, constant_values=-1).ravel()

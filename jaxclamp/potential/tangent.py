@@ -96,7 +96,7 @@ class Linearised:
     """with the pressures at their best, uJ, (n_cells,)"""
     force: Array
     """d Pi/dx of the cells' nodes at the stored pressures, mN, (n_en, 3, n_cells)"""
-    matrix: Array
+    matrix: Array | None
     """condensed tangent, mN/mm, (n_en, n_en, 6, n_cells)"""
     missing_force: Array | None = None
     """what condensing the pressures adds to the force, mN, (n_en, 3, n_cells)"""
@@ -296,17 +296,19 @@ def linearise(potential: Potential, state: State, pattern: Pattern) -> Linearisa
         return assemble(potential, pattern, jax.device_get(pieces))
 
 
-def assemble(potential: Potential, pattern: Pattern, pieces: list[list[Linearised]]) -> Linearisation:
+def assemble(potential: Potential, pattern: Pattern, pieces: list[list[Any]]) -> Linearisation:
     """Pieces summed into residual and tangent, on the host: a sum is no program to compile."""
     layout, n_q = potential.layout, len(RIGID)
     free = np.asarray(layout.free)
     values = np.zeros(len(pattern.indices))
     wall, missing, loads = np.zeros((3, layout.n_nodes, 3))
     slope, stiffness, coupling = np.zeros(n_q), np.zeros((n_q, n_q)), np.zeros((n_q, layout.n_nodes, 3))
-    found: list[Any] = [joined(*each) for each in zip(potential.groups, pieces, strict=True)]
-    for group, cells in zip(potential.groups, found, strict=True):
+    found: list[Any] = []
+    for group, blocks in zip(potential.groups, pieces, strict=True):
         nodes = np.asarray(group.nodes)
-        values += pattern.places[group.region] @ cells.matrix.ravel()
+        values += pattern.places[group.region] @ np.concatenate([block.matrix.ravel() for block in blocks])
+        cells: Any = joined(group, [dataclasses.replace(block, matrix=None) for block in blocks])
+        found.append(cells)
         _add(loads if group.volume is None else wall, nodes, cells.force)
         if group.volume is not None:
             _add(missing, nodes, cells.missing_force)

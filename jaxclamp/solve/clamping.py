@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,15 +13,17 @@ import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, TermMissing
 from jaxclamp.core.progress import Progress, Tell, teller
+from jaxclamp.core.surroundings import require_fit
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.files import require_computable
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import CLOSING_PATH, branch_of
+from jaxclamp.solve.easing import keep_hardened, with_softer_contact
 from jaxclamp.solve.gaps import require_a_gap
 from jaxclamp.solve.linear_solvers import Factors
 from jaxclamp.solve.memory import require_memory, unknowns_of
 from jaxclamp.solve.nested import NEAR, to_walk_on
-from jaxclamp.solve.results import Result, work_balance
+from jaxclamp.solve.results import Kept, Result, work_balance
 from jaxclamp.solve.stages import Clamping
 from jaxclamp.solve.warm import branch_from, on_mesh_of, solve_warm
 
@@ -68,6 +71,10 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
         every_term = guess.every_term
     elif to_stop and (coarser := to_walk_on(scene)) is not None:
         result, attempt = _from_coarser_mesh(model, coarser, tell, start)
+        if result is not None:
+            return result
+    elif to_stop and (softer := with_softer_contact(scene)) is not None:
+        result = _from_softer_contact(model, softer, tell, start)
         if result is not None:
             return result
     attempt = Clamping(model, tell, every_term=every_term, before=attempt)
@@ -137,12 +144,37 @@ def _from_coarser_mesh(
         found = False
     if not found:
         return None, clamping
-    last, width = clamping.states[-1], clamping.states[-1].values["lumen_width_mm"]
-    apart = float(np.max(np.abs(np.asarray(last.state.x - near.states[-1].state.x))))
-    if last.equilibrium.negative_pivots or apart > NEAR * width:
+    if not _sure(clamping.states[-1], near.states[-1]):
         return None, clamping
-    clamping.states[-1:] = [kept for kept in path.states[:-1] if kept.stage == "clamping"] + [last]
-    return _result(clamping, None, start, CLOSING_PATH, path), clamping
+    clamping.states[-1:] = [*path.closing[:-1], clamping.states[-1]]
+    result = _result(clamping, None, start, CLOSING_PATH, path)
+    return dataclasses.replace(result, coarser=path), clamping
+
+
+def _sure(last: Kept, near: Kept) -> bool:
+    """True if a state at the stop is stable, and near to the one that it was found from."""
+    apart = float(np.max(np.abs(np.asarray(last.state.x - near.state.x))))
+    return not last.equilibrium.negative_pivots and apart <= NEAR * float(last.values["lumen_width_mm"])
+
+
+def _from_softer_contact(model: Model, softer: Scene, tell: Tell, start: float) -> Result | None:
+    """The result with its closing path walked with softer contact; None where that leads to nothing sure."""
+    try:
+        path = _solve(softer, None, tell, to_stop=True)
+    except EquilibriumError:
+        return None
+    if path.solver["branch"] != CLOSING_PATH:
+        return None
+    solver = path.factors.take(np.asarray(path.states[-1].equilibrium.lin.values))
+    clamping = Clamping(model, tell, solver, every_term=path.every_term)
+    try:
+        found = solve_warm(clamping, path, to_stop=True, carried_over=False)
+    except (EquilibriumError, TermMissing):
+        return None
+    if not found or not _sure(clamping.states[-1], path.states[-1]):
+        return None
+    keep_hardened(clamping, path)
+    return _result(clamping, None, start, CLOSING_PATH, path)
 
 
 @contextmanager
@@ -150,6 +182,7 @@ def _beside(clamping: Clamping) -> Iterator[Future[None]]:
     """In another thread meanwhile, the state in the body is found, and what closing needs is compiled."""
 
     def work() -> None:
+        require_fit()  # settings of JAX may be of one thread alone
         in_body = clamping.in_body(clamping.load_free())
         clamping.use_terms(closing=True)
         clamping.system.linearise(in_body.state, in_body.pressure)
@@ -196,11 +229,12 @@ def _result(
     failure: EquilibriumError | None,
     start: float,
     branch: str | None = None,
-    coarser: Result | None = None,
+    path: Result | None = None,
 ) -> Result:
     """What a clamping came to.
 
-    branch: of an answer that was followed from a neighbour's; coarser: with the closing path that led here
+    branch: of an answer that was followed from a neighbour's; path: of a coarser mesh or softer contact, with
+    the closing path that led here
     """
     system, states = clamping.system, tuple(clamping.states)
     closing = [kept for kept in states if kept.stage == "clamping"]
@@ -216,10 +250,10 @@ def _result(
         "assembly_s": system.assembly_seconds - system.compile_seconds,
         "factor_s": system.solver.factor_seconds,
     }
-    balance = work_balance(closing) if coarser is None else coarser.solver["work_balance_error"]
-    if coarser is not None:
-        counts = {key: count + coarser.solver[key] for key, count in counts.items()}
-        seconds = {key: part + coarser.cost[key] for key, part in seconds.items()}
+    balance = work_balance(closing) if path is None else path.solver["work_balance_error"]
+    if path is not None:
+        counts = {key: count + path.solver[key] for key, count in counts.items()}
+        seconds = {key: part + path.cost[key] for key, part in seconds.items()}
     solver = {
         "linear_solver": system.solver.name,
         **counts,
@@ -233,6 +267,4 @@ def _result(
     cost = {"wall_s": time.perf_counter() - start, **seconds, "peak_memory_MB": peak_memory_MB()}
     settings = clamping.model.scene.solver
     factors = Factors(clamping.model.pattern, settings.linear_solver, system.solver)
-    return Result(
-        clamping.model, states, failure, solver, cost, factors, clamping.every_term, coarser=coarser
-    )
+    return Result(clamping.model, states, failure, solver, cost, factors, clamping.every_term)

@@ -12,8 +12,10 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
-from optimize.front import BEATEN, WITHIN, Front, Point
+from optimize.front import BEATEN, WITHIN, Front, Point, Searches
 from optimize.front_report import page, plot_front
+from optimize.record import Evaluation
+from optimize.starts import Budget
 from optimize.study_file import load_study
 
 STUDY = """
@@ -125,6 +127,90 @@ def test_a_point_that_is_beaten_within_its_error_is_said_so(tmp_path, errors, wo
     assert any(np.ptp(end) == pytest.approx(2.0 * errors["point-3"]) for end in ends)
 
 
+def test_a_front_whose_points_are_all_beaten_keeps_its_numbers(tmp_path):
+    """No curve is drawn; it used to be the word "-", which turned the heights of the axis into categories."""
+    axes = plot_front(front_of(tmp_path, ROWS | {"reference": (0.5, 0.5)}, {})).axes[0]
+    assert not axes.yaxis.have_units()
+    low, high = axes.get_ylim()
+    assert low < 0.5 < 5.0 < high
+
+
+CENTRES = {PEAK: np.array([0.3, 0.2]), PRESSURE: np.array([1.2, 1.5])}
+
+
+@pytest.fixture
+def bowls(monkeypatch):
+    """Stand-ins for solutions: each objective is 1 plus the squared distance of the slopes from a centre.
+
+    `scale` is a factor of both; `warm` takes what a search is to be told instead of the values.
+    """
+    seen = SimpleNamespace(scale=1.0, warm=lambda problem, values: values)
+
+    def solved(scene):
+        away = {m: np.asarray(scene.clamp.jaw.slopes) - centre for m, centre in CENTRES.items()}
+        return SimpleNamespace(away=away, final={}, measure=lambda m: seen.scale * (1.0 + away[m] @ away[m]))
+
+    def evaluated(problem, design, near):
+        result = solved(problem.scene_at(design))
+        values = np.array([result.measure(m) for m in problem.measures])
+        gradients = np.array([2.0 * seen.scale * result.away[m] for m in problem.measures])
+        return Evaluation(design, seen.warm(problem, values), gradients, 1), result
+
+    monkeypatch.setattr("optimize.evaluator.evaluate", evaluated)
+    monkeypatch.setattr("optimize.study.clamp", solved)
+    return seen
+
+
+def swept(folder: Path, most: int, resume: bool = False) -> tuple[Point, ...]:
+    asked, budget = load_study(written(folder)).problem, Budget("slsqp", most, 1e-6)
+    return Searches(asked, PRESSURE, budget, folder / "out", resume, lambda event: None).points(3)
+
+
+def journal_of(folder: Path, point: int) -> dict[str, Any]:
+    return json.loads((folder / "out" / f"point-{point}" / "study.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.0 + 1e-9])
+@pytest.mark.parametrize("most", [2, 12])
+def test_a_front_goes_on_with_a_greater_budget_or_other_last_digits(tmp_path, bowls, most, scale):
+    """Start and limit of every point stay; they used to follow from the points before, another study then."""
+    before = swept(tmp_path, 2)
+    rows = [journal_of(tmp_path, n)["iterations"] for n in (1, 2, 3)]
+    bowls.scale = scale
+    after = swept(tmp_path, most, resume=True)
+    assert [p.limit for p in after] == [p.limit for p in before]
+    assert [journal_of(tmp_path, n)["iterations"][:2] for n in (1, 2, 3)] == rows
+    assert all((p.evaluations > 2) == (most > 2) for p in after)
+    gained = before[0].result.measure(PEAK) - after[0].result.measure(PEAK)
+    assert (gained > 1e-3) == (most > 2)
+
+
+def test_a_point_begins_at_no_design_that_a_solution_from_scratch_does_not_find(tmp_path, bowls):
+    """The second design of the first point is said to have next to no contact pressure."""
+    told = []
+
+    def flatter(problem, values):
+        told.append(values)
+        return np.array([values[0], 0.01]) if len(told) == 2 else values
+
+    bowls.warm = flatter
+    points = swept(tmp_path, 12)
+    second = journal_of(tmp_path, 1)["iterations"][1]
+    assert second["values"][1] == 0.01
+    assert np.abs(np.subtract(journal_of(tmp_path, 3)["design"]["start"], second["design"])).max() > 1e-3
+    assert points[2].result.measure(PRESSURE) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_how_far_a_point_violates_its_limit_is_said_of_the_solution_from_scratch(tmp_path, bowls):
+    """While the middle is searched, contact pressures are told too low by a tenth."""
+    is_middle = lambda problem: np.isfinite(problem.constraints[0].upper)
+    bowls.warm = lambda problem, values: values * [1.0, 0.9] if is_middle(problem) else values
+    begin, middle, end = swept(tmp_path, 12)
+    assert (begin.violation, end.violation) == (0.0, 0.0)
+    assert middle.violation == pytest.approx(middle.result.measure(PRESSURE) / middle.limit - 1.0)
+    assert middle.violation > 0.05
+
+
 @pytest.mark.slow
 def test_a_front_is_swept_resumed_and_drawn(tmp_path, capsys):
     out, path = tmp_path / "out", written(tmp_path)
@@ -137,7 +223,7 @@ def test_a_front_is_swept_resumed_and_drawn(tmp_path, capsys):
     assert first[0] == pytest.approx(min(first), rel=1e-6)
     assert second[-1] == pytest.approx(min(second), rel=1e-6)
     middle = found["front"][1]
-    assert middle["limit"] == pytest.approx(0.5 * (second[0] + second[-1]))
+    assert middle["limit"] == pytest.approx(0.5 * (second[0] + second[-1]), rel=1e-5)
     start = found["start"]["objectives"]
     assert first[0] < start[0]
     assert second[-1] < start[1]
@@ -161,6 +247,14 @@ def test_a_front_is_swept_resumed_and_drawn(tmp_path, capsys):
     assert json.loads((out / "point-3" / "study.json").read_text())["iterations"] == rows
     assert again["front"][0]["objectives"] == pytest.approx(found["front"][0]["objectives"], rel=1e-9)
     assert again["front"][1]["objectives"] == pytest.approx(middle["objectives"], rel=1e-6)
+
+    # with a greater budget, every point goes on from what it has
+    written(tmp_path, STUDY.replace("max_evaluations = 6", "max_evaluations = 8"))
+    assert main([*command, "--resume"]) == 0
+    more = json.loads(capsys.readouterr().out)["front"]
+    assert more[1]["limit"] == again["front"][1]["limit"]
+    assert json.loads((out / "point-3" / "study.json").read_text())["iterations"][: len(rows)] == rows
+    assert more[0]["objectives"][0] <= again["front"][0]["objectives"][0] * (1.0 + 1e-6)
 
     # a study of one objective is not taken for a front
     (out / "study.json").write_text('{"fingerprint": "a"}', encoding="utf-8")

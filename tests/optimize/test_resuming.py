@@ -102,41 +102,29 @@ def without(*path):
     return damage
 
 
-DAMAGES = {
+HOPELESS = {
     "no iterations": (without("iterations"), "iterations are missing"),
     "no fingerprint": (without("fingerprint"), "fingerprint is missing"),
     "iterations no list": (lambda c: c.update(iterations={"a": 1}), "are no list"),
     "rows no tables": (
         lambda c: c.update(iterations=[1, "two", None]),
-        "row 1 of its iterations is no table (0 of 3",
+        "row 1 of its iterations is no table, so that nothing is left to go on with",
     ),
-    "no design": (without("iterations", 1, "design"), "row 2 of its iterations has no design (2 of 3"),
-    "no values": (without("iterations", 1, "values"), "has no values (2 of 3"),
-    "no gradients": (without("iterations", 1, "gradients"), "has no gradients"),
-    "no start": (without("iterations", 1, "start"), "has no start"),
-    "no failure": (without("iterations", 1, "failure"), "has no failure"),
-    "no newton": (without("iterations", 1, "newton_iterations"), "has no newton_iterations"),
-    "empty values": (second("values", []), "values that are not 2 numbers (2 of 3 rows are sound)"),
-    "short design": (second("design", [1.0]), "design that are not 2 numbers"),
-    "long design": (second("design", [1.0, 1.0, 1.0]), "design that are not 2 numbers"),
-    "short gradients": (second("gradients", [[1.0, 1.0]]), "gradients that are not 2 lists"),
-    "ragged gradients": (second("gradients", [[1.0, 1.0], [1.0]]), "gradients that are not 2 numbers"),
-    "flat gradients": (second("gradients", [1.0, 1.0]), "gradients that are not 2 numbers"),
-    "strings": (second("values", ["90.0", "3"]), "values that are not 2 numbers"),
-    "a string": (second("design", "ab"), "design that are not 2 numbers"),
-    "booleans": (second("design", [True, False]), "design that are not 2 numbers"),
-    "null": (second("values", [None, 1.0]), "values that are not 2 numbers"),
-    "huge": (second("values", [10**400, 1.0]), "values that are not 2 numbers"),
-    "newton text": (second("newton_iterations", "12"), "newton_iterations that is no whole number"),
-    "start text": (second("start", "1"), "start that is no whole number"),
-    "failure number": (second("failure", 3), "failure that is no text"),
     "another start": (lambda c: c["iterations"].pop(0), "row 1 of its iterations is not the start design"),
+    "another start, and damage": (
+        lambda c: (c["iterations"].pop(0), c["iterations"].append(1)),
+        "row 1 of its iterations is not the start design",
+    ),
+    "rows of another start": (
+        lambda c: (c["iterations"][0].update(start=2), c["iterations"].insert(1, None)),
+        "row 2 of its iterations is no table, so that nothing is left to go on with",
+    ),
 }
 
 
-@pytest.mark.parametrize("name", DAMAGES)
-def test_a_damaged_journal_is_one_sentence(asked, tmp_path, name):
-    damage, said = DAMAGES[name]
+@pytest.mark.parametrize("name", HOPELESS)
+def test_a_journal_without_a_sound_row_is_one_sentence(asked, tmp_path, name):
+    damage, said = HOPELESS[name]
     content = journalled(asked, tmp_path / "out")
     damage(content)
     path = tmp_path / "out" / "study.json"
@@ -150,6 +138,54 @@ def test_a_damaged_journal_is_one_sentence(asked, tmp_path, name):
     assert "\n" not in sentence
     assert json.loads(path.read_text(encoding="utf-8")) == content, "what was there is kept"
     Journal(tmp_path / "out", resume=True).close()  # nobody holds it
+
+
+DAMAGES = {
+    "no table": (lambda c: c["iterations"].insert(1, None), "is no table"),
+    "no design": (without("iterations", 1, "design"), "has no design"),
+    "no values": (without("iterations", 1, "values"), "has no values"),
+    "no gradients": (without("iterations", 1, "gradients"), "has no gradients"),
+    "no start": (without("iterations", 1, "start"), "has no start"),
+    "no failure": (without("iterations", 1, "failure"), "has no failure"),
+    "no newton": (without("iterations", 1, "newton_iterations"), "has no newton_iterations"),
+    "empty values": (second("values", []), "has values that are not 2 numbers"),
+    "short design": (second("design", [1.0]), "has design that are not 2 numbers"),
+    "long design": (second("design", [1.0, 1.0, 1.0]), "has design that are not 2 numbers"),
+    "short gradients": (second("gradients", [[1.0, 1.0]]), "has gradients that are not 2 lists"),
+    "ragged gradients": (second("gradients", [[1.0, 1.0], [1.0]]), "has gradients that are not 2 numbers"),
+    "flat gradients": (second("gradients", [1.0, 1.0]), "has gradients that are not 2 numbers"),
+    "strings": (second("values", ["90.0", "3"]), "has values that are not 2 numbers"),
+    "a string": (second("design", "ab"), "has design that are not 2 numbers"),
+    "booleans": (second("design", [True, False]), "has design that are not 2 numbers"),
+    "null": (second("values", [None, 1.0]), "has values that are not 2 numbers"),
+    "huge": (second("values", [10**400, 1.0]), "has values that are not 2 numbers"),
+    "newton text": (second("newton_iterations", "12"), "has a newton_iterations that is no whole number"),
+    "start text": (second("start", "1"), "has a start that is no whole number"),
+    "failure number": (second("failure", 3), "has a failure that is no text"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_study_goes_on_with_the_rows_before_the_damage(asked, tmp_path, name):
+    """Said in one sentence; the damaged file is kept, and an earlier one beside it."""
+    damage, said = DAMAGES[name]
+    content = journalled(asked, tmp_path / "out")
+    damage(content)
+    path = tmp_path / "out" / "study.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    (tmp_path / "out" / "study.json.damaged").write_text("of another day", encoding="utf-8")
+    record, heard = resumed(asked, tmp_path / "out")
+    assert [list(e.values) for e in record.evaluations] == [[90.0, 3e3]]
+    (sentence,) = (event.message for event in heard)
+    assert sentence.startswith(f"{path}: row 2 of its iterations {said}")
+    assert sentence.endswith(
+        "going on with the rows before it, the damaged file is kept as study.json.damaged-2"
+    )
+    assert "\n" not in sentence
+    assert json.loads((tmp_path / "out" / "study.json.damaged-2").read_text(encoding="utf-8")) == content
+    assert (tmp_path / "out" / "study.json.damaged").read_text(encoding="utf-8") == "of another day"
+    again, heard = resumed(asked, tmp_path / "out")
+    assert (len(again.evaluations), heard) == (1, [])
 
 
 @pytest.mark.parametrize(
@@ -186,11 +222,18 @@ def test_a_journal_that_is_no_study_is_exit_code_2(asked, tmp_path, capsys, text
 
 
 def test_damage_of_another_start_is_no_silence(asked, tmp_path):
-    content = journalled(asked, tmp_path / "start-2")
+    """Its process goes on with what is sound and hands over the sentence, or raises it."""
+    folder, budget = tmp_path / "start-2", Budget(asked.method, 1, 1e-4)
+    content = journalled(asked, folder)
     content["iterations"][1]["values"] = []
-    write_whole(tmp_path / "start-2" / "study.json", json.dumps(content))
+    write_whole(folder / "study.json", json.dumps(content))
+    found, told = from_another_start(asked.problem, budget, folder, resume=True)
+    assert [list(e.values) for e in found] == [[90.0, 3e3]]
+    assert ["start-2" in event.message for event in told] == [True]
+    content["iterations"][0] = None
+    write_whole(folder / "study.json", json.dumps(content))
     with pytest.raises(jc.SceneError, match="start-2"):
-        from_another_start(asked.problem, Budget(asked.method, 3, 1e-4), tmp_path / "start-2", resume=True)
+        from_another_start(asked.problem, budget, folder, resume=True)
 
 
 def test_a_lost_process_of_another_start_is_one_sentence():

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import types
 
+import numpy as np
 import pytest
 
 import jaxclamp as jc
+from jaxclamp.show.report import STYLE
 from optimize.gains import Gain
+from optimize.record import Evaluation, Record
+from optimize.study import solved_cold
+from optimize.study_file import load_study
 from optimize.verification import Verification, verify
 
 
@@ -55,7 +61,10 @@ def test_a_finer_model_without_equilibrium_has_no_gain():
     assert (said["gain"], said["gain_difference"], said["survives"]) == (None, None, False)
 
 
-@pytest.mark.parametrize("error", [jc.TooLittleMemory("it needs 9 GB"), jc.SceneError("it is too stiff")])
+FAILURES = [jc.TooLittleMemory("it needs 9 GB"), jc.SceneError("it is too stiff"), jc.Unfit("no device")]
+
+
+@pytest.mark.parametrize("error", FAILURES)
 def test_a_finer_model_that_cannot_be_solved_leaves_the_study(error, monkeypatch):
     """Stand-ins for results: each has a scene and a value."""
 
@@ -67,6 +76,24 @@ def test_a_finer_model_that_cannot_be_solved_leaves_the_study(error, monkeypatch
     problem = types.SimpleNamespace(objective=jc.clamp_force())
     found = verify(problem, {"start": result, "best": result})
     assert found.sentence == f"the finer model was not solved: best: {error}"
+
+
+@pytest.mark.parametrize("error", FAILURES)
+def test_a_reference_that_cannot_be_solved_leaves_the_study(error, monkeypatch):
+    """Beside it, the best is the start here, whose solution is at hand."""
+
+    def clamp(scene):
+        raise error
+
+    monkeypatch.setattr("optimize.study.clamp", clamp)
+    record = Record(load_study("human-lad-jaw").problem, "slsqp", [])
+    record.evaluations.append(
+        Evaluation(record.problem.start, np.full(len(record.problem.measures), 3.0), np.ones((1, 1)), 9)
+    )
+    start, told = types.SimpleNamespace(), []
+    best, result, reference = solved_cold(record, start, None, told.append)
+    assert (best, result, reference) == (record.evaluations[0], start, None)
+    assert [event.message for event in told] == [f"no reference: {error}"]
 
 
 @pytest.mark.parametrize(
@@ -81,3 +108,14 @@ def test_a_finer_model_that_cannot_be_solved_leaves_the_study(error, monkeypatch
 )
 def test_the_opening_boxes_of_a_report(gain, card):
     assert gain.card("the start") == card
+
+
+def test_a_long_number_stays_inside_its_box():
+    """A box may be narrower than its words and breaks them anywhere; the number does not forbid that."""
+    rules = {
+        selector.strip(): dict(pair.split(":") for pair in re.sub(r"\s", "", body).split(";") if ":" in pair)
+        for selector, body in re.findall(r"([^{}]+){([^{}]*)}", STYLE)
+    }
+    box, big = rules[".headlines div"], rules[".headlines b"]
+    assert (box["min-width"], box["overflow-wrap"]) == ("0", "anywhere")
+    assert not {"white-space", "overflow-wrap", "word-break", "width", "min-width"} & set(big)
