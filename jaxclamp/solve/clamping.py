@@ -58,10 +58,10 @@ def inflate(scene: Scene, *, guess: Result | None = None) -> Result:
 def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Result:
     start = time.perf_counter()
     require_computable(scene)
-    if to_stop:
-        require_a_gap(scene)
     if (unknowns := unknowns_of(scene.mesh)) > (0 if guess is None else guess.model.pattern.n):
         require_memory(unknowns)  # a guess of as many is proof that they fit
+    if to_stop:
+        require_a_gap(scene)
     model = build_model(scene, None if guess is None else guess.model)
     attempt, every_term = None, False
     if guess is not None:

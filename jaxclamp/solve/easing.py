@@ -29,9 +29,6 @@ EVERY = 3
 """of so many states on the way, one is found with the scene's own contact, and kept"""
 
 
-_closed_so_far = OcclusionStop(kind="occlusion", occlusion=jnp.asarray(1.0))
-
-
 def with_softer_contact(scene: Scene) -> Scene | None:
     """The scene to walk the closing path of; None where its contact is not hard."""
     own, fit = scene.contact, fitting_contact(scene.artery)
@@ -50,10 +47,11 @@ def keep_hardened(clamping: Clamping, soft: Result) -> None:
 
     One that is not found so, or not stable, is not kept.
     """
+    closed_so_far = OcclusionStop(kind="occlusion", occlusion=jnp.asarray(1.0))
     last = clamping.states.pop()
     for kept in soft.closing[:-1][::-EVERY][::-1]:
         known = clamping.known(clamping.body, kept.state)
-        step = clamping.step(Until(_closed_so_far, clamping.occlusion(kept.state), known))
+        step = clamping.step(Until(closed_so_far, clamping.occlusion(kept.state), known))
         with contextlib.suppress(NotConverged, EquilibriumError):
             clamping.tell_closing(0.0, newton(clamping.system, kept.state, step))
     clamping.states.append(last)

@@ -16,6 +16,8 @@ ALONG = np.linspace(-0.95, 0.95, 20)
 in its middle, where a profile of |z| has no derivative and no contact point lies"""
 ON_FACE = 1e-9
 """gap that counts as none, over the half extent"""
+MOST_STEPS = 40
+"""of Newton's method to the face"""
 UNIT = 0.01
 """how far the gradient's length may be from 1: the blends of shipped faces are off by 0.003, and contact that
 presses wrongly by a hundredth is below what a usual mesh adds"""
@@ -29,8 +31,7 @@ def require_a_gap(scene: Scene) -> None:
     far = 1e3 * float(scene.artery.layers[-1].inner_radius)
     depth = 0.1 * float(scene.clamp.jaw.half_extent())
     heights = np.array([-far, -depth, 0.0, depth])
-    points = (jnp.zeros(4), jnp.asarray(heights), jnp.zeros(4))
-    gap = np.asarray(_gap(scene.clamp.jaw, points))
+    gap = _seen(scene.clamp.jaw, np.zeros(4), heights, np.zeros(4))[0]
     wanted = "a gap that is positive below the jaw's lowest point, 0 there and negative inside the jaw"
     good = np.all(np.isfinite(gap)) and gap[0] > 0.0 and gap[1] > 0.0 and gap[3] < 0.0
     if not good or abs(gap[2]) > 1e-6 * depth:
@@ -44,7 +45,7 @@ def _require_a_distance(scene: Scene) -> None:
     jaw, outer = scene.clamp.jaw, scene.artery.layers[-1]
     extent, radius = float(jaw.half_extent()), float(outer.inner_radius + outer.thickness)
     x, z = (each.ravel() for each in np.meshgrid([0.0, radius], extent * ALONG))
-    y, gap, length = (np.asarray(each) for each in _face(jaw, jnp.asarray(x), jnp.asarray(z)))
+    y, gap, length = face(jaw, x, z)
     finite = np.isfinite(gap) & np.isfinite(length)
     wrong = np.flatnonzero(~finite | (np.abs(gap) <= ON_FACE * extent) & (np.abs(length - 1.0) > UNIT))
     if wrong.size:
@@ -56,27 +57,39 @@ def _require_a_distance(scene: Scene) -> None:
         )
 
 
-_gap = jax.jit(lambda jaw, points: jaw.gap(points))
-
-
-@jax.jit
-def _face(jaw: Jaw, x: Array, z: Array) -> tuple[Array, Array, Array]:
+def face(jaw: Jaw, x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Heights of the face at x, z (n,), by Newton's method; gap and length of its gradient there, (n,).
 
     Where there is no face, as beyond a side, the height is of some point and the gap is not 0.
     """
+    y = np.zeros_like(x)
+    gap, gradient = _seen(jaw, x, y, z)
+    for _ in range(MOST_STEPS):
+        with np.errstate(all="ignore"):
+            nearer = y - gap / gradient[1]
+        nearer = np.where(np.isfinite(nearer), nearer, y)
+        if np.array_equal(nearer, y):
+            break
+        y = nearer
+        gap, gradient = _seen(jaw, x, y, z)
+    return y, gap, np.sqrt(np.sum(gradient**2, axis=0))
 
+
+def _seen(jaw: Jaw, *points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gap (n,) and its gradient (3, n) at x, y, z (n,); n is at most that of the points of a face."""
+    n, most = len(points[0]), 2 * len(ALONG)
+    gap, gradient = _program(jaw, tuple(np.resize(each, most) for each in points))
+    return np.asarray(gap)[:n], np.asarray(gradient)[:, :n]
+
+
+def _gap_and_gradient(jaw: Jaw, points: tuple[Array, ...]) -> tuple[Array, Array]:
     def summed(points: tuple[Array, ...]) -> tuple[Array, Array]:
         gap = jaw.gap(points)
         return jnp.sum(gap), gap
 
-    seen = jax.grad(summed, has_aux=True)
+    gradient, gap = jax.grad(summed, has_aux=True)(points)
+    return gap, jnp.stack(gradient)
 
-    def nearer(_: int, y: Array) -> Array:
-        gradient, gap = seen((x, y, z))
-        found = y - gap / gradient[1]
-        return jnp.where(jnp.isfinite(found), found, y)
 
-    y = jax.lax.fori_loop(0, 40, nearer, jnp.zeros_like(x))
-    gradient, gap = seen((x, y, z))
-    return y, gap, jnp.sqrt(sum(jnp.square(each) for each in gradient))
+# for a few points it is compiled for a short compilation rather than for speed
+_program = jax.jit(_gap_and_gradient, compiler_options={"xla_backend_optimization_level": 0})

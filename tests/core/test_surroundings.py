@@ -146,7 +146,7 @@ def test_the_least_of_machine_and_container_is_what_is_left(proc):
 def test_containers_of_version_1_are_seen(proc):
     (proc / "proc" / "self" / "cgroup").write_text("3:cpu:/\n4:memory:/lost\n")
     (proc / "cgroup" / "memory").mkdir()
-    (proc / "cgroup" / "memory" / "memory.limit_in_bytes").write_text(f"{500 * 2**20}\n")
+    (proc / "cgroup" / "memory" / "memory.limit_in_bytes").write_text(f"{300 * 2**20}\n")
     (proc / "cgroup" / "memory" / "memory.usage_in_bytes").write_text(f"{100 * 2**20}\n")
     (proc / "cgroup" / "memory" / "memory.stat").write_text("cache 1\n")
     assert memory.limits_MB()[0] == (200.0, "the container")
@@ -186,7 +186,7 @@ import resource
 from jaxclamp.cli import main
 from jaxclamp.core import memory
 size = memory._kB(memory.PROC / "self" / "status", "VmSize:")
-resource.setrlimit(resource.RLIMIT_AS, (int(size * 1024) + 500 * 2**20,) * 2)
+resource.setrlimit(resource.RLIMIT_AS, (int(size * 1024) + 300 * 2**20,) * 2)
 print(main(["run", "human-lad", "--json"]))
 """
     done = script(text)

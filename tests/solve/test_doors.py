@@ -174,7 +174,7 @@ class Undefined(Cylinder):
 
 @record
 class Kinked(Cylinder):
-    """A bar whose gap has no derivative to the sides of its middle."""
+    """A bar whose gap has values, but no derivative."""
 
     shape: str = static("kinked")
 
@@ -196,8 +196,8 @@ class Tilted(Cylinder):
     ("jaw", "said"),
     [
         (Doubled, "of length 1 there; it is .* mm with one of 2 at x = 0, y = 2.06, z = -2.85 mm$"),
-        (Undefined, "it is nan mm with one of nan at x = 0, y = 0, z = -2.85 mm$"),
-        (Kinked, "it is .* mm with one of nan at x = 0, y = .*, z = 1.05 mm$"),
+        (Undefined, "it is nan mm with one of 0 at x = 0, y = 0, z = -2.85 mm$"),
+        (Kinked, "it is .* mm with one of nan at x = 0, y = 2.06, z = -2.85 mm$"),
         (Tilted, "it is .* mm with one of 1.41 at x = 3.73, y = "),
     ],
 )
@@ -212,7 +212,7 @@ JAWS = (
     "{ shape = 'flat', half_width_mm = 0.02, edge_radius_mm = 3.0 }",
     "{ shape = 'spline', half_width_mm = 2.0, slopes = [0.0, 0.2, 0.3, 0.3], edge_radius_mm = 0.5 }",
     "{ shape = 'spline', half_width_mm = 2.0, slopes = [0.5, -0.3, 0.6, -0.2, 0.4], edge_radius_mm = 0.3 }",
-    "{ shape = 'spline', half_width_mm = 2.0, slopes = [-0.1, 2.0, 9.0, 20.0], edge_radius_mm = 0.1 }",
+    "{ shape = 'spline', half_width_mm = 2.0, slopes = [0.1, 2.0, 9.0, 20.0], edge_radius_mm = 0.1 }",
 )
 
 
@@ -221,8 +221,8 @@ def test_faces_that_ship_are_seen_and_have_a_distance(jaw):
     """Most of the points that are looked at are on the face."""
     scene = small(f"clamp.jaw={jaw}")
     gaps.require_a_gap(scene)
-    z = jnp.asarray(float(scene.clamp.jaw.half_extent()) * gaps.ALONG)
-    gap = np.asarray(gaps._face(scene.clamp.jaw, jnp.zeros_like(z), z)[1])
+    z = float(scene.clamp.jaw.half_extent()) * gaps.ALONG
+    gap = gaps.face(scene.clamp.jaw, np.zeros_like(z), z)[1]
     assert np.mean(np.abs(gap) < 1e-9) >= 0.9
 
 

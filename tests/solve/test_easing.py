@@ -28,6 +28,7 @@ def eased() -> jc.Result:
 @pytest.fixture
 def walked(monkeypatch) -> jc.Result:
     """The same, all the way with its own contact."""
+    eased()  # before, as it is kept for all tests
     monkeypatch.setattr(easing, "HARD", np.inf)
     return jc.clamp(scene())
 
