@@ -63,6 +63,12 @@ again, leaves, gap = call_elsewhere(seen, scene)
 assert again == scene and type(again.clamp.jaw) is Bar
 assert leaves == len(jax.tree_util.tree_leaves(scene))
 assert gap == 2.0, gap
+
+radius = lambda c: jc.evaluate(
+    jc.replace(scene, "artery.layers[1].material.c", c), jc.physiological_lumen_radius()
+)
+direct, (compiled,) = float(radius(25.0)), jax.jit(jax.vmap(radius))(jnp.array([25.0]))
+assert abs(direct - compiled) < 1e-9 * direct, (direct, compiled)
 print("done")
 """
 
