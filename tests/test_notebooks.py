@@ -29,7 +29,13 @@ def test_script_and_notebook_agree_and_carry_no_output(script):
         assert cell.get("execution_count") is None
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+QUICK = ("first_clamping",)
+
+
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param(s, marks=() if s.stem in QUICK else pytest.mark.slow, id=s.stem) for s in SCRIPTS],
+)
 @pytest.mark.filterwarnings("default")  # those of the notebook machinery are not ours
 def test_notebook_runs(script, monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))

@@ -31,7 +31,12 @@ SLOW = pytest.mark.slow
 
 @pytest.mark.parametrize(
     "choice",
-    ["yz", pytest.param("xz", marks=SLOW), pytest.param("z", marks=SLOW), pytest.param("none", marks=SLOW)],
+    [
+        pytest.param("yz", marks=SLOW),
+        pytest.param("xz", marks=SLOW),
+        pytest.param("z", marks=SLOW),
+        pytest.param("none", marks=SLOW),
+    ],
 )
 def test_the_same_scene_in_lower_symmetry(eighth, choice):
     """Every figure and the derivatives, to solver tolerance; the supports across carry nothing."""

@@ -87,6 +87,7 @@ def test_a_design_is_put_into_the_scene():
 # --- one evaluation -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_values_and_gradients_of_a_design():
     """Objective and constraints at once, against finite differences."""
     problem = dataclasses.replace(
@@ -468,6 +469,7 @@ def test_measures_agree_with_the_record():
     assert result.measure(jc.jaw_half_width()) == 3.0
 
 
+@pytest.mark.slow
 def test_the_command_line_does_a_study(tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["optimise", str(written(tmp_path)), "--out", str(out), "--json", "--quiet"]) == 0

@@ -226,6 +226,7 @@ def test_a_stop_out_of_reach_keeps_what_converged(stop):
 # ------------------------------------------------------------------ variants of the model
 
 
+@pytest.mark.slow
 def test_one_layer_with_printed_equation_10_and_a_spline_jaw():
     """The media alone at 4 kPa; its fibres are softer by Eq. (10), so that it is wider than by Eq. (4)."""
     media = small().artery.layers[0]

@@ -43,7 +43,13 @@ def assert_closed(result: jc.Result) -> None:
         assert result.solver["work_balance_error"] < 1e-2
 
 
-@pytest.mark.parametrize("jaw", [pytest.param("cylinder 0.5", marks=pytest.mark.slow), "flat 1.0, edge 0.3"])
+@pytest.mark.parametrize(
+    "jaw",
+    [
+        pytest.param("cylinder 0.5", marks=pytest.mark.slow),
+        pytest.param("flat 1.0, edge 0.3", marks=pytest.mark.slow),
+    ],
+)
 def test_two_jaws_on_the_mesh_of_the_study(jaw):
     assert_closed(close(jaw, "10x15x8"))
 

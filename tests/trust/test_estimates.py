@@ -40,6 +40,7 @@ def share_of_good(cases) -> float:
     return float(np.mean([1.0 / FACTOR <= ratio <= FACTOR for ratio in every]))
 
 
+@pytest.mark.slow
 def test_estimates_of_tubes_are_within_a_factor_of_three():
     """In nine cases of ten, here of ten: the tube of 2002 and four that nobody tuned to."""
     assert share_of_good([(SEED, SEED_PRESSURE, SEED_STRETCH), *map(random_sectors, range(4))]) >= 0.9

@@ -96,6 +96,7 @@ def test_the_ladder_varies_one_thing_at_a_time():
     assert scaled(scene.mesh, 2.0).radial == (10, 6)
 
 
+@pytest.mark.slow
 def test_a_variant_is_solved_with_its_price():
     scene = jc.load_scene("human-lad", [*TINY, "stop.occlusion=0.5"])
     price = accuracy.solve(accuracy.Rung("mesh", "tiny", scene))
