@@ -5,15 +5,12 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, TermMissing
 from jaxclamp.core.progress import Progress, Tell, teller
-from jaxclamp.core.surroundings import require_fit
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.files import require_computable
 from jaxclamp.scenes.scene import Scene
@@ -125,19 +122,14 @@ def _from_coarser_mesh(
         if event.stage == walked
         else None
     )
-    clamping = Clamping(model, lambda event: None)
-    with _beside(clamping) as in_body:
-        try:
-            path = _solve(coarser, None, tell_of_path, to_stop=True)
-        except EquilibriumError:
-            clamping.system.patience = 0  # nobody waits for the state in the body any more
-            return None, None
-        near = on_mesh_of(model, path) if path.solver["branch"] == CLOSING_PATH else None
-        if near is None:
-            return None, None
-        if in_body.exception() is not None:
-            clamping = Clamping(model, tell)
-    clamping.tell, clamping.every_term = tell, path.every_term
+    try:
+        path = _solve(coarser, None, tell_of_path, to_stop=True)
+    except EquilibriumError:
+        return None, None
+    near = on_mesh_of(model, path) if path.solver["branch"] == CLOSING_PATH else None
+    if near is None:
+        return None, None
+    clamping = Clamping(model, tell, every_term=path.every_term)
     try:
         found = solve_warm(clamping, near, to_stop=True, carried_over=True)
     except (EquilibriumError, TermMissing):
@@ -175,25 +167,6 @@ def _from_softer_contact(model: Model, softer: Scene, tell: Tell, start: float) 
         return None
     keep_hardened(clamping, path)
     return _result(clamping, None, start, CLOSING_PATH, path)
-
-
-@contextmanager
-def _beside(clamping: Clamping) -> Iterator[Future[None]]:
-    """In another thread meanwhile, the state in the body is found, and what closing needs is compiled."""
-
-    def work() -> None:
-        require_fit()  # settings of JAX may be of one thread alone
-        in_body = clamping.in_body(clamping.load_free())
-        clamping.use_terms(closing=True)
-        clamping.system.linearise(in_body.state, in_body.pressure)
-
-    with ThreadPoolExecutor(1) as pool:
-        future = pool.submit(work)
-        try:
-            yield future
-        except BaseException:
-            clamping.system.patience = 0
-            raise
 
 
 def _from_nothing(clamping: Clamping, to_stop: bool, start: float) -> Result:

@@ -49,17 +49,14 @@ def on_mesh_of(model: Model, guess: Result) -> Result | None:
 def solve_warm(clamping: Clamping, guess: Result, to_stop: bool, carried_over: bool) -> bool:
     """Solve from a neighbour's states, over scenes in between if the way is long.
 
-    clamping: with its own state in the body, or without states
-    carried_over: the guess's states are of another mesh and no equilibria of this one
+    carried_over: the states are of another mesh and no equilibria of this one
 
     False if that does not work and a cold start is needed.
     """
     target, in_body, last = clamping.model, guess.physiological, guess.states[-1]
     assert guess.load_free is not None
     assert in_body is not None
-    if clamping.states:
-        pass
-    elif not carried_over and same_artery(target.scene, guess.scene):
+    if not carried_over and same_artery(target.scene, guess.scene):
         clamping.take_over(guess.load_free, in_body)
     else:
         try:
