@@ -138,7 +138,7 @@ def _from_coarser_mesh(
         return None, clamping
     if not _sure(clamping.states[-1], near.states[-1]):
         return None, clamping
-    clamping.states[-1:] = [*path.closing[:-1], clamping.states[-1]]
+    clamping.states[-1:] = [*path.on_the_way, clamping.states[-1]]
     result = _result(clamping, None, start, CLOSING_PATH, path)
     return dataclasses.replace(result, coarser=path), clamping
 
@@ -161,11 +161,11 @@ def _from_softer_contact(model: Model, softer: Scene, tell: Tell, start: float) 
     clamping = Clamping(model, tell, solver, every_term=path.every_term)
     try:
         found = solve_warm(clamping, path, to_stop=True, carried_over=False)
+        if not found or not _sure(clamping.states[-1], path.states[-1]):
+            return None
+        keep_hardened(clamping, path)
     except (EquilibriumError, TermMissing):
         return None
-    if not found or not _sure(clamping.states[-1], path.states[-1]):
-        return None
-    keep_hardened(clamping, path)
     return _result(clamping, None, start, CLOSING_PATH, path)
 
 

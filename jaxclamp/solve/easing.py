@@ -26,7 +26,7 @@ HARD = 3.0
 SOFTER, SMOOTHER = 8.0, 2.5
 """how much softer than what fits the wall, and smoothed over how much more, contact on the way then is"""
 EVERY = 3
-"""of so many states on the way, one is found with the scene's own contact, and kept"""
+"""of so many states on the way, one is found with the scene's own contact, and kept: the first, and so on"""
 
 
 def with_softer_contact(scene: Scene) -> Scene | None:
@@ -43,15 +43,17 @@ def with_softer_contact(scene: Scene) -> Scene | None:
 
 
 def keep_hardened(clamping: Clamping, soft: Result) -> None:
-    """Find states on the way to the last one with the scene's own contact, at the same height of the jaw.
+    """Find states on the way to the last one with the scene's own contact, at the same occlusion.
 
-    One that is not found so, or not stable, is not kept.
+    From first contact on; one that is not found so, or not stable, is not kept. Raises TermMissing.
     """
     closed_so_far = OcclusionStop(kind="occlusion", occlusion=jnp.asarray(1.0))
     last = clamping.states.pop()
-    for kept in soft.closing[:-1][::-EVERY][::-1]:
+    for kept in soft.on_the_way[::EVERY]:
         known = clamping.known(clamping.body, kept.state)
         step = clamping.step(Until(closed_so_far, clamping.occlusion(kept.state), known))
         with contextlib.suppress(NotConverged, EquilibriumError):
-            clamping.tell_closing(0.0, newton(clamping.system, kept.state, step))
+            found = newton(clamping.system, kept.state, step)
+            if not found.negative_pivots:
+                clamping.tell_closing(0.0, found)
     clamping.states.append(last)

@@ -157,6 +157,11 @@ class Result:
         return next(iter(self._stage("physiological")), None)
 
     @property
+    def on_the_way(self) -> list[Kept]:
+        """States under the closing jaws before the last one."""
+        return [kept for kept in self.states[:-1] if kept.stage == "clamping"]
+
+    @property
     def closing(self) -> list[Kept]:
         """The physiological state and all states with the jaws on the artery."""
         return self._stage("physiological") + self._stage("clamping")

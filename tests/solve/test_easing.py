@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import numpy as np
 import pytest
 
 import jaxclamp as jc
+from jaxclamp.core.failures import TermMissing
 from jaxclamp.potential.tangent import linearise
 from jaxclamp.solve import easing
 from jaxclamp.solve.branch import CLOSING_PATH
@@ -43,14 +45,35 @@ def test_the_answer_is_that_of_a_path_with_its_own_contact(walked):
 
 def test_every_state_that_is_kept_is_one_of_the_scene():
     result = eased()
-    assert len(result.closing) >= 4
-    for kept in result.closing:
+    assert len(result.on_the_way) >= 2
+    for kept in (*result.on_the_way, result.states[-1]):
         potential = result.model.solved(closing=True).at_pressure(kept.equilibrium.pressure)
         lin = linearise(potential, kept.state, result.model.pattern)
         assert np.linalg.norm(lin.residual) < 1e-8 * lin.reactions
+        assert kept.equilibrium.negative_pivots == 0
     travels = [record["jaw_travel_mm"] for record in result.history if record["stage"] == "clamping"]
     assert travels == sorted(travels)
+    assert travels[0] < 0.1  # first contact is there
     assert travels[-1] == pytest.approx(0.8, rel=1e-8)
+
+
+def test_an_unstable_state_on_the_way_is_not_kept(monkeypatch):
+    found = easing.newton
+    unstable = lambda *known: dataclasses.replace(found(*known), negative_pivots=1)
+    monkeypatch.setattr(easing, "newton", unstable)
+    result = jc.clamp(scene())
+    assert result.on_the_way == []
+    np.testing.assert_array_equal(result.states[-1].state.x, eased().states[-1].state.x)
+
+
+def test_a_term_that_is_missing_on_the_way_has_the_scene_s_own_path_walked(monkeypatch, walked):
+    monkeypatch.setattr(easing, "HARD", 3.0)
+
+    def missing(*known):
+        raise TermMissing("inner walls meet")
+
+    monkeypatch.setattr(easing, "newton", missing)
+    np.testing.assert_array_equal(jc.clamp(scene()).states[-1].state.x, walked.states[-1].state.x)
 
 
 def test_contact_that_fits_the_wall_is_not_softened():

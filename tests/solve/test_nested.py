@@ -46,6 +46,9 @@ def test_each_state_is_an_equilibrium_of_the_mesh_that_it_names():
     meshes = [record["mesh"] for record in result.history]
     assert meshes[0] == meshes[-1] == result.scene.mesh.words == "6 x 9 x (3 + 2)"
     assert set(meshes[1:-1]) == {result.coarser.scene.mesh.words} != {meshes[0]}
+    stages = [record["stage"] for record in result.history]
+    assert stages == ["physiological"] + ["clamping"] * (len(stages) - 1)
+    assert [kept.stage for kept in result.states] == ["load-free", *stages]
     occlusions = [record["occlusion"] for record in result.history]
     assert occlusions == sorted(occlusions)
     for kept in result.states[1:]:
