@@ -76,7 +76,7 @@ def _meshes(result: Clamped, marked: dict[str, int]) -> list[Line2D]:
     if (meshes := meshes_of(result, marked)) is None:
         return []
     own, path = meshes
-    filled = Line2D([], [], color=FAINT, linestyle="none", marker="D", markersize=6, label=own)
+    filled = Line2D([], [], color=FAINT, linestyle="none", marker="o", markersize=8, label=own)
     return [Line2D([], [], color=FAINT, label=f"curve: {path}"), filled]
 
 
