@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -92,6 +94,12 @@ def lumen_height(x: Array, marks: Landmarks) -> Array:
     """Height of the lumen at mid-length on the compression axis, mm; x: positions, (n_nodes, 3)."""
     top = x[marks.lumen_top, 1]
     return 2.0 * top if marks.lumen_bottom is None else top - x[marks.lumen_bottom, 1]
+
+
+def half_height(x: Array, marks: Landmarks) -> float:
+    """Half the height of the lumen, mm, of known positions."""
+    on_host: Any = np.asarray(x)  # JAX would compile every slice
+    return 0.5 * float(lumen_height(on_host, marks))
 
 
 def lumen_width(x: Array, marks: Landmarks) -> Array:

@@ -6,9 +6,7 @@ q: y_c = sum_a S[q, c, a] x_a, tangents of a cell, or the position and tangents 
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from jaxclamp.core.records import record
 from jaxclamp.fem.elements import Element, lagrange, lobatto, tensor_rule
@@ -20,20 +18,24 @@ class FacetRule:
 
     weights: np.ndarray
     """(n_q,)"""
-    N: np.ndarray
-    """shape functions, (n_q, n_fn)"""
-    dN: np.ndarray
-    """their derivatives by the facet's circumferential and axial coordinates, (n_q, 2, n_fn)"""
+    surface: np.ndarray
+    """stencil of the position and its tangents by the facet's circumferential and axial coordinates,
+    (n_q, 3, n_fn)"""
 
     @property
-    def position(self) -> np.ndarray | Array:
+    def position(self) -> np.ndarray:
         """Stencil of the position, (n_q, 1, n_fn)."""
-        return self.N[:, None]
+        return self.surface[:, :1]
 
     @property
-    def surface(self) -> Array:
-        """Stencil of the position and its two tangents, (n_q, 3, n_fn)."""
-        return jnp.concatenate([self.N[:, None], self.dN], axis=1)
+    def N(self) -> np.ndarray:
+        """Shape functions, (n_q, n_fn)."""
+        return self.surface[:, 0]
+
+    @property
+    def dN(self) -> np.ndarray:
+        """Their derivatives: the stencil of the tangents, (n_q, 2, n_fn)."""
+        return self.surface[:, 1:]
 
 
 @record
@@ -60,7 +62,7 @@ def facet_rule(element: Element, rule: tuple[np.ndarray, np.ndarray]) -> FacetRu
     """A quadrature rule (points (n_q, 2), weights (n_q,)) on the facets of an element."""
     points, weights = rule
     N, dN = lagrange(element.nodes_1d, points)
-    return FacetRule(weights=weights, N=N, dN=dN)
+    return FacetRule(weights=weights, surface=np.concatenate([N[:, None], dN], axis=1))
 
 
 def build_stencils(element: Element, contact_points: int) -> Stencils:

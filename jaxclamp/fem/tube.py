@@ -98,6 +98,12 @@ def axial_fractions(mesh: Mesh, settings: MeshSettings) -> Array:
     return half if mesh.grid[2] == half.shape[0] else jnp.concatenate([-half[:0:-1], half])
 
 
+@jax.jit
+def grid_lines(mesh: Mesh, settings: MeshSettings) -> tuple[Array, Array]:
+    """`axial_fractions` and `angles`, in one program."""
+    return axial_fractions(mesh, settings), angles(mesh, settings)
+
+
 def _heights(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """Load-free axial position of each axial grid line, mm, (n_z,)."""
     return end_height(artery, 1.0) * axial_fractions(mesh, settings)

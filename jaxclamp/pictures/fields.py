@@ -13,7 +13,6 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxclamp.fem.elements import Element
@@ -24,7 +23,7 @@ from jaxclamp.observe.stresses import facet_contact, stresses
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
-from jaxclamp.potential.terms import JAWS
+from jaxclamp.potential.terms import JAWS, Group
 
 STRESSES = {
     "axial_stress_kPa": "axial",
@@ -130,7 +129,19 @@ def _summed(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     return np.bincount(cells.ravel(), np.broadcast_to(values, cells.shape).ravel(), n)
 
 
-_facet_contact = jax.jit(facet_contact)
+# for a few states it is compiled for a short compilation rather than for speed
+_contact = jax.jit(facet_contact, compiler_options={"xla_backend_optimization_level": 0})
+
+
+def contact_at_points(group: Group, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Contact pressure on the deformed outer wall, kPa, and area of its points, mm^2, (n_q, n_facets)."""
+    pressure, area = jax.device_get(_contact(group, state))
+    return pressure, area
+
+
+def _shape_functions(group: Group) -> np.ndarray:
+    """Of the contact points of a group of jaw contact, (n_q, n_fn)."""
+    return np.asarray(group.here(JAWS).rule.surface)[:, 0]
 
 
 def nodal_contact_pressure(model: Model, state: State) -> np.ndarray:
@@ -138,9 +149,9 @@ def nodal_contact_pressure(model: Model, state: State) -> np.ndarray:
     n = model.mesh.n_nodes
     force, around = np.zeros(n), np.zeros(n)
     for group in model.potential.of(JAWS):
-        pressure, area = (np.asarray(v) for v in _facet_contact(group, state))
+        pressure, area = contact_at_points(group, state)
         nodes = np.asarray(group.nodes).ravel()
-        share = np.abs(np.asarray(group.here(JAWS).rule.N)).T
+        share = np.abs(_shape_functions(group)).T
         force += np.bincount(nodes, (share @ (pressure * area)).ravel(), n)
         around += np.bincount(nodes, (share @ area).ravel(), n)
     return np.divide(force, around, out=np.zeros(n), where=around > 0.0)
@@ -155,8 +166,8 @@ def contact_along(model: Model, state: State) -> tuple[np.ndarray, np.ndarray]:
     rings, heights, places = [], [], []
     for group in model.potential.of(JAWS):
         nodes = np.asarray(group.nodes)
-        pressure = np.asarray(_facet_contact(group, state)[0])  # (n_q, n_facets)
-        z = np.asarray(group.here(JAWS).rule.N) @ np.asarray(state.x)[nodes, 2]
+        pressure, _ = contact_at_points(group, state)
+        z = _shape_functions(group) @ np.asarray(state.x)[nodes, 2]
         rings.append(np.min(nodes, axis=0) // (n_c * n_r))
         highest = np.argmax(pressure, axis=0)[None]
         heights.append(np.take_along_axis(pressure, highest, 0)[0])
@@ -335,7 +346,7 @@ def jaw_outline(jaw: Jaw, height: float, n: int = 301) -> np.ndarray:
     z = np.linspace(-1.1 * extent, 1.1 * extent, n)
     y = np.linspace(-extent, top + 0.1 * extent, n)
     zz, yy = np.meshgrid(z, y)
-    gap = _gap(jaw, (jnp.zeros_like(zz), jnp.asarray(yy), jnp.asarray(zz)))
+    gap = np.asarray(_gap(jaw, (np.zeros_like(zz), yy, zz)))
     curves = [np.asarray(c) for c in contour_generator(z, y, np.maximum(gap, yy - top)).lines(0.0)]
     return max(curves, key=len)
 
@@ -345,5 +356,5 @@ def jaw_height_shown(model: Model, state: State, open_height: float | None) -> f
 
     open_height: the outer radius in the body, where known
     """
-    outer = float(state.x[model.marks.outer_top, 1])
-    return min(float(state.jaw_height), max(outer, open_height or outer))
+    outer = float(np.asarray(state.x)[model.marks.outer_top, 1])
+    return min(float(np.asarray(state.q)[0]), max(outer, open_height or outer))

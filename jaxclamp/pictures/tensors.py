@@ -13,9 +13,15 @@ from jax import Array
 
 from jaxclamp.core.tensors import stacked
 from jaxclamp.fem.landmarks import extrapolation
-from jaxclamp.observe.stresses import cauchy_stress, facet_contact, strain_energy
+from jaxclamp.observe.stresses import cauchy_stress, strain_energy
 from jaxclamp.physics.materials import FibreLaw
-from jaxclamp.pictures.fields import DEFORMATION, LayerFields, averaged, on_both_sides
+from jaxclamp.pictures.fields import (
+    DEFORMATION,
+    LayerFields,
+    averaged,
+    contact_at_points,
+    on_both_sides,
+)
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.tangent import Piece, cut, joined
@@ -32,7 +38,7 @@ def _of_piece(cells: Piece) -> tuple[Array, Array, Array]:
     return stacked(F), stacked(sigma), strain_energy(cells)
 
 
-_facet_contact = jax.jit(facet_contact)
+_directions = jax.jit(lambda material: material.directions())
 
 
 def with_tensors(model: Model, state: State, layers: tuple[LayerFields, ...]) -> tuple[LayerFields, ...]:
@@ -65,7 +71,7 @@ def _at_nodes(layer: LayerFields, values: np.ndarray) -> np.ndarray:
 def _stress_free_fibres(group: Group) -> list[np.ndarray]:
     """Direction of each family along the material axes at the quadrature points, (3, n_q, n_cells)."""
     material, shape = group.solid.material, group.solid.dV.shape
-    families = material.directions() if isinstance(material, FibreLaw) else ()
+    families = jax.device_get(_directions(material)) if isinstance(material, FibreLaw) else ()
     return [np.stack([np.broadcast_to(c, shape) for c in direction]) for direction in families]
 
 
@@ -96,5 +102,5 @@ def highest_contact(model: Model, state: State) -> np.ndarray:
     highest = np.zeros(model.mesh.n_cells)
     for group in model.potential.of(JAWS):
         facets = model.discretisation.sides["upper" if group.here(JAWS).side > 0 else "lower"]
-        highest[model.mesh.outer_cells[facets]] = np.max(_facet_contact(group, state)[0], axis=0)
+        highest[model.mesh.outer_cells[facets]] = np.max(contact_at_points(group, state)[0], axis=0)
     return highest

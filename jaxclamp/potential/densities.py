@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxclamp.core.records import record, static
@@ -27,6 +28,11 @@ Density = Callable[[Tensor, Rigid, Any], Array]
 RIGID = ("jaw_height",)
 """rigid coordinates q: the height of the upper jaw's lowest point above the artery's axis, mm; where both
 jaws are modelled, the lower one is its mirror image"""
+
+
+def rigid(height: float) -> Array:
+    """Rigid coordinates, (n_q,), mm, all at one height."""
+    return jax.device_put(np.full(len(RIGID), float(height)))
 
 
 @record

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxclamp.core.programs import forget_if_crowded
 from jaxclamp.core.records import record, shape_of
 from jaxclamp.fem.grid import Mesh
 from jaxclamp.fem.landmarks import Landmarks, find_landmarks
-from jaxclamp.fem.pattern import Layout, Pattern, Region, block_size, build_pattern
+from jaxclamp.fem.pattern import FACETS_PER_BLOCK, Layout, Pattern, Region, block_size, build_pattern
 from jaxclamp.fem.stencils import Stencils, build_stencils
 from jaxclamp.fem.symmetry import Symmetry, symmetry_of
 from jaxclamp.fem.tube import build_tube, end_height, end_lines, supports
@@ -95,13 +96,13 @@ def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
     sides = _sides(mesh, scene.mesh)
     size = block_size(len(stencils.weights))
     nodes = {f"layer {i}": (mesh.cells[:, slice(*span)], size) for i, span in enumerate(mesh.layer_cells)}
-    nodes["lumen"] = (mesh.inner_facets, mesh.inner_facets.shape[1])
+    nodes["lumen"] = (mesh.inner_facets, FACETS_PER_BLOCK)
     for name, facets in sides.items():
-        nodes[f"{name} inside"] = (mesh.inner_facets[:, facets], len(facets))
-        nodes[f"{name} outside"] = (mesh.outer_facets[:, facets], len(facets))
+        nodes[f"{name} inside"] = (mesh.inner_facets[:, facets], FACETS_PER_BLOCK)
+        nodes[f"{name} outside"] = (mesh.outer_facets[:, facets], FACETS_PER_BLOCK)
     layout, regions, pattern = build_pattern(supports(mesh, scene.mesh), nodes)
     marks = find_landmarks(mesh, scene.mesh, tuple(layer.name for layer in scene.artery.layers))
-    stencils, layout, regions = jax.tree_util.tree_map(jnp.asarray, (stencils, layout, regions))
+    layout, regions = jax.device_put((layout, regions))
     return Discretisation(
         mesh=mesh, stencils=stencils, layout=layout, regions=regions, sides=sides, marks=marks
     ), pattern
@@ -119,17 +120,24 @@ def _sides(mesh: Mesh, settings: MeshSettings) -> dict[str, np.ndarray]:
 
 def potential_of(scene: Scene, discretisation: Discretisation) -> Potential:
     """The potential of a scene with all its terms; a JAX function of every float in it."""
-    d = discretisation
-    terms = _terms(scene.artery, scene.clamp, scene.contact, scene.mesh, d)
-    return build_potential(terms, d.regions, d.stencils, d.layout)
+    return _potential(_terms, scene, discretisation)
 
 
-@jax.jit
+def _potential(terms: Terms, scene: Scene, d: Discretisation) -> Potential:
+    found = terms(scene.artery, scene.clamp, scene.contact, scene.mesh, d)
+    return build_potential(found, d.regions, d.stencils, d.layout)
+
+
 def _terms(
     artery: Artery, clamp: Clamp, contact: Contact, settings: MeshSettings, d: Discretisation
 ) -> tuple[Term | Volume, ...]:
     body = tube_body(d.mesh, d.stencils, settings, artery)
     return all_terms(Made(artery, clamp, contact, body, d.stencils, d.sides))
+
+
+Terms = Callable[[Artery, Clamp, Contact, MeshSettings, Discretisation], tuple[Term | Volume, ...]]
+# called once for a scene, it is compiled for a short compilation rather than for speed
+_terms_of_a_scene = jax.jit(_terms, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def positions(scene: Scene, discretisation: Discretisation, free: Array) -> Array:
@@ -152,8 +160,8 @@ def build_model(scene: Scene, like: Model | None = None) -> Model:
     else:
         discretisation, pattern = discretise(scene)
     # float64 arrays, as in derivatives: Python's floats would make JAX compile everything once more
-    floats = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, jnp.float64), scene)
-    return Model(scene, discretisation, pattern, potential_of(floats, discretisation))
+    floats = jax.tree_util.tree_map(lambda leaf: np.asarray(leaf, float), scene)
+    return Model(scene, discretisation, pattern, _potential(_terms_of_a_scene, floats, discretisation))
 
 
 def bare(scene: Scene) -> Scene:

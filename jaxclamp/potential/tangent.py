@@ -62,7 +62,7 @@ class Pressures:
 
     p: Array
     """(n_m, n_cells)"""
-    modes: Array
+    modes: AnyArray
     """(n_m, n_q)"""
     stiffness: Array
     """M^-1, (n_m, n_m, n_cells)"""
@@ -72,7 +72,7 @@ class Pressures:
 class Piece:
     """Cells of one group, cut out of potential and state; it knows no names."""
 
-    stencil: Array
+    stencil: AnyArray
     """(n_q, n_c, n_en)"""
     x: Array
     """current position of the nodes, mm, (n_en, 3, n_cells)"""
@@ -189,7 +189,9 @@ def cut(group: Group, state: State) -> list[Piece]:
             found = a[..., first : first + group.size]
             return np.concatenate([found, *[found[..., -1:]] * missing], axis=-1) if missing else found
 
-        heres = jax.tree_util.tree_map(lambda a: of(a) if np.ndim(a) > 1 else a, cells.heres)
+        heres = jax.tree_util.tree_map(
+            lambda a: of(a) if np.ndim(a) > 1 and a.shape[-1] == n else a, cells.heres
+        )
         pressures = cells.pressures
         if pressures is not None:
             pressures = dataclasses.replace(pressures, p=of(pressures.p), stiffness=of(pressures.stiffness))
@@ -261,7 +263,7 @@ def _interpolated(pressures: Pressures) -> Array:
 
 
 def _condensed(
-    pressures: Pressures, solid: Solid, stencil: Array, y: Tensor, found: dict[str, Any]
+    pressures: Pressures, solid: Solid, stencil: AnyArray, y: Tensor, found: dict[str, Any]
 ) -> dict[str, Any]:
     """What eliminating the pressures of the cells changes and adds."""
     p, modes, stiffness = pressures.p, pressures.modes, pressures.stiffness

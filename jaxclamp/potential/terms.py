@@ -90,13 +90,13 @@ class Group:
     """(n_en, n_cells)"""
     size: int = static()
     """cells of a block"""
-    stencil: Array
+    stencil: Array | np.ndarray
     """(n_q, n_c, n_en)"""
     terms: tuple[Term, ...]
     """differentiated together"""
     volume: Volume | None
     """None where cells need not keep their volume"""
-    modes: Array | None
+    modes: Array | np.ndarray | None
     """of the pressure, (n_m, n_q); None without `volume`"""
 
     @property
@@ -366,10 +366,10 @@ def build_potential(
             region=place[0],
             nodes=region.nodes,
             size=region.size,
-            stencil=jnp.asarray(at[place[1]]),
+            stencil=at[place[1]],
             terms=tuple(t for t in members if isinstance(t, Term)),
             volume=volume,
-            modes=None if volume is None else jnp.asarray(stencils.modes),
+            modes=None if volume is None else stencils.modes,
         )
 
     return Potential(groups=tuple(group(*item) for item in together.items()), layout=layout)

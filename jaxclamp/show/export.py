@@ -74,6 +74,7 @@ def _write_all(result: Result, folder: Path, tell: Callable[[float, str], Any]) 
     for plate in figures(result):
         tell(0.5 + 0.1 * len(plates), plate.title.lower())
         plates.append((plate, png(plate.figure)))
+        plate.figure.set_layout_engine("none")  # it is laid out; once is enough
         for suffix, content in (("png", plates[-1][1]), ("svg", svg(plate.figure))):
             path = folder / FIGURES / f"{plate.name}.{suffix}"
             path.write_bytes(content)

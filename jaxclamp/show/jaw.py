@@ -52,7 +52,7 @@ def profile(jaw: Jaw, height: float) -> tuple[np.ndarray, np.ndarray]:
     closed = np.sum(cut) < 3  # round above, such as a bar
     z, y = (z, y) if closed else (z[~cut], y[~cut])
     for _ in range(4):
-        z, y = (np.asarray(v) for v in _onto_face(jaw, jnp.asarray(z), jnp.asarray(y)))
+        z, y = (np.asarray(v) for v in _onto_face(jaw, z, y))
     face = _apart(np.stack([z, y], axis=1))
     ends = np.array([[face[-1, 0], curve[top, 1]], [face[0, 0], curve[top, 1]]])
     return face, face if closed else np.concatenate([face, ends])

@@ -20,14 +20,14 @@ import numpy as np
 from jaxclamp.core.failures import NotConverged
 from jaxclamp.core.programs import forget_if_crowded
 from jaxclamp.fem.grid import Mesh, build_block
-from jaxclamp.fem.pattern import Layout, Pattern, block_size, build_pattern
+from jaxclamp.fem.pattern import FACETS_PER_BLOCK, Layout, Pattern, block_size, build_pattern
 from jaxclamp.fem.stencils import build_stencils
 from jaxclamp.observe.stresses import cauchy_stress
 from jaxclamp.physics.contact import Contact
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.physics.materials import Material
 from jaxclamp.potential.bodies import Body, brick_body, facet_areas
-from jaxclamp.potential.densities import RIGID, Touch, jaw_energy
+from jaxclamp.potential.densities import Touch, jaw_energy, rigid
 from jaxclamp.potential.energy import State, energy, with_equilibrium_pressure
 from jaxclamp.potential.tangent import whole
 from jaxclamp.potential.terms import JAWS, Potential, Term, build_potential, wall_terms
@@ -91,9 +91,9 @@ def brick(
     fixed = np.asarray(held(X) if callable(held) else held, bool)
     size = block_size(len(stencils.weights))
     nodes = {f"layer {i}": (mesh.cells[:, slice(*span)], size) for i, span in enumerate(mesh.layer_cells)}
-    nodes["upper outside"] = (mesh.outer_facets, mesh.outer_facets.shape[1])
+    nodes["upper outside"] = (mesh.outer_facets, FACETS_PER_BLOCK)
     layout, regions, pattern = build_pattern(fixed, nodes)
-    stencils, layout, regions = jax.tree_util.tree_map(jnp.asarray, (stencils, layout, regions))
+    layout, regions = jax.device_put((layout, regions))
     body = brick_body(mesh, stencils, X, materials)
     terms = list(wall_terms(body, stencils, [str(i) for i in range(len(layers))]))
     if jaw is not None:
@@ -102,7 +102,7 @@ def brick(
         touch = {"name": JAWS, "region": "upper outside", "stencil": "contact"}
         terms.append(Term(density=jaw_energy, here=here, moved=True, **touch))
     potential = build_potential(terms, regions, stencils, layout)
-    potential = jax.tree_util.tree_map(jnp.asarray, potential)
+    potential = jax.device_put(potential)
     return Block(body=body, held=fixed, positions=X, potential=potential, pattern=pattern)
 
 
@@ -159,7 +159,7 @@ def _carried_along(block: Block, way: np.ndarray) -> np.ndarray:
 
 def at_rest(block: Block, x: np.ndarray, jaw_height: float = OPEN) -> State:
     """The state with nodes at x (n_nodes, 3) and pressures that fit."""
-    q = jnp.full(len(RIGID), jaw_height, float)
+    q = rigid(jaw_height)
     return with_equilibrium_pressure(block.potential, jnp.asarray(x), q)
 
 

@@ -145,7 +145,7 @@ def _from_coarser_mesh(
 
 def _sure(last: Kept, near: Kept) -> bool:
     """True if a state at the stop is stable, and near to the one that it was found from."""
-    apart = float(np.max(np.abs(np.asarray(last.state.x - near.state.x))))
+    apart = float(np.max(np.abs(np.asarray(last.state.x) - np.asarray(near.state.x))))
     return not last.equilibrium.negative_pivots and apart <= NEAR * float(last.values["lumen_width_mm"])
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import jax.numpy as jnp
+import jax
+import numpy as np
 
 from jaxclamp.core.failures import NotConverged
 from jaxclamp.potential.energy import State
@@ -18,10 +19,12 @@ FIRST_STEP, SMALLEST_STEP, LARGEST_STEP = 0.12, 0.12 / 32, 0.15
 
 def stretched(state: State, end_height: float) -> State:
     """The state with all axial positions scaled so that the end plane is at `end_height`, mm."""
-    z = state.x[:, 2]
-    if abs(float(jnp.max(z)) - end_height) <= 1e-14 * end_height:
+    x = np.array(state.x)
+    top = float(np.max(x[:, 2]))
+    if abs(top - end_height) <= 1e-14 * end_height:
         return state
-    return dataclasses.replace(state, x=state.x.at[:, 2].set(z * (end_height / jnp.max(z))))
+    x[:, 2] *= end_height / top
+    return dataclasses.replace(state, x=jax.device_put(x))
 
 
 def follow(

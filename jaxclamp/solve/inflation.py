@@ -16,7 +16,7 @@ from jax import Array
 
 from jaxclamp.fem.elements import gauss
 from jaxclamp.fem.grid import Mesh
-from jaxclamp.fem.tube import closed_positions, closed_radii, sector_share
+from jaxclamp.fem.tube import closed_positions, sector_share
 from jaxclamp.potential.energy import State, with_equilibrium_pressure
 from jaxclamp.potential.terms import Potential
 from jaxclamp.scenes.scene import Artery, MeshSettings
@@ -60,9 +60,9 @@ def inflated_radius(artery: Artery, load_free_radius: float) -> float | None:
     balloon) is found as well as any other: it is the one that inflation from no load comes to.
     """
     # constants that vary from point to point count with their mean: this is a start, not an answer
-    artery = jax.tree_util.tree_map(lambda a: jnp.mean(a) if jnp.ndim(a) > 1 else a, artery)
+    artery = jax.tree_util.tree_map(lambda a: np.mean(a) if np.ndim(a) > 1 else np.asarray(a, float), artery)
     radii = load_free_radius * np.geomspace(SMALLEST, LARGEST, CANDIDATES)
-    levels = np.asarray(tube_potential(artery, jnp.asarray(radii)))
+    levels = np.asarray(tube_potential(artery, radii))
     inside = levels[1:-1]
     lowest = np.flatnonzero((inside < levels[:-2]) & (inside <= levels[2:])) + 1
     if lowest.size == 0:
@@ -76,10 +76,10 @@ def inflated_radius(artery: Artery, load_free_radius: float) -> float | None:
 def closed_tube(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """Load-free positions of the incompressible round tube that the sectors close to, mm, (n_nodes, 3)."""
     guess = closed_positions(mesh, settings, artery)
-    radius = float(closed_radii(mesh, artery)[0])
-    alone = dataclasses.replace(artery, pressure=jnp.asarray(0.0), axial_stretch=jnp.asarray(1.0))
+    radius = float(np.hypot(*np.asarray(guess)[0, :2]))
+    alone = dataclasses.replace(artery, pressure=jnp.zeros(()), axial_stretch=jnp.ones(()))
     found = inflated_radius(alone, radius)
-    return guess if found is None else inflated_positions(guess, alone, radius, found)
+    return guess if found is None else inflated_positions(guess, 1.0, radius, found)
 
 
 def inflated_tube(
@@ -89,14 +89,13 @@ def inflated_tube(
     radius = inflated_radius(artery, load_free_radius)
     if radius is None:
         return None
-    x = inflated_positions(load_free.x, artery, load_free_radius, radius)
+    x = inflated_positions(load_free.x, float(artery.axial_stretch), load_free_radius, radius)
     return with_equilibrium_pressure(potential, x, load_free.q)
 
 
 @jax.jit
-def inflated_positions(x: Array, artery: Artery, load_free_radius: Array, radius: Array) -> Array:
+def inflated_positions(x: Array, stretch: Array, load_free_radius: Array, radius: Array) -> Array:
     """Load-free positions x (n_nodes, 3) moved with an incompressible tube to a new inner radius, mm."""
-    stretch = artery.axial_stretch
     squared = x[:, 0] ** 2 + x[:, 1] ** 2
     moved = jnp.sqrt(radius**2 + (squared - load_free_radius**2) / stretch)
     share = (moved / jnp.sqrt(squared))[:, None]

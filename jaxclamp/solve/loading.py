@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, Failure, NotConverged, SceneError
@@ -209,7 +208,7 @@ def _kept(group: Any, models: list[Model]) -> Kept:
     own = {key: value for key, value in e.items() if key not in ("state", "lin")}
     equilibrium = _checked(
         Equilibrium(
-            state=State(**{n: jnp.asarray(v) for n, v in arrays("state/", state).items()}),
+            state=jax.device_put(State(**arrays("state/", state))),
             lin=_checked(Linearisation(**arrays("lin/", lin), **e["lin"])),
             **arrays("", {"responses": (n_free, 1 + n_q)}),
             **own,

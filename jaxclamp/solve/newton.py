@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxclamp.core.failures import Exhausted, NotConverged, Singular
@@ -266,7 +265,7 @@ def predict(system: System, near: Equilibrium, step: Step) -> State:
 
 def moved(q: jax.Array, by: float) -> jax.Array:
     """Rigid coordinates with the driven one moved by a distance, mm."""
-    return jnp.asarray(q).at[0].add(by)
+    return jax.device_put(np.asarray(q) + by * np.eye(1, len(q))[0])
 
 
 def _largest(dx: np.ndarray, dq: np.ndarray) -> float:

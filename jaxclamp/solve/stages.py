@@ -9,16 +9,17 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, Exhausted, NotConverged, TermMissing
 from jaxclamp.core.progress import Progress, Tell
 from jaxclamp.core.records import UNIT_FACTOR
-from jaxclamp.fem.landmarks import lumen_height
+from jaxclamp.fem.landmarks import half_height
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import Record, read_figures
 from jaxclamp.observe.stops import OcclusionStop
 from jaxclamp.observe.stresses import Stresses, stresses
-from jaxclamp.potential.densities import RIGID
+from jaxclamp.potential.densities import rigid
 from jaxclamp.potential.energy import State, with_equilibrium_pressure
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import INTIMA
@@ -111,12 +112,11 @@ class Clamping:
         marks, potential = self.model.marks, self.model.potential
         self.body = body
         self.body_stresses = stresses(potential, body) if body_stresses is None else body_stresses
-        self.lumen_radius = 0.5 * float(lumen_height(body.x, marks))
-        self.outer_radius = float(body.x[marks.outer_top, 1])
-        self.system.length = self.lumen_radius
+        self.lumen_radius = self.system.length = half_height(body.x, marks)
+        self.outer_radius = float(np.asarray(body.x)[marks.outer_top, 1])
         # smoothed contact presses before it touches
         clear = self.outer_radius + 2.0 * float(self.model.scene.contact.smoothing)
-        self.first_measure = self.measure(dataclasses.replace(body, q=jnp.full(len(RIGID), clear, float)))
+        self.first_measure = self.measure(dataclasses.replace(body, q=rigid(clear)))
 
     def take_over(self, *kept: Kept) -> None:
         """Go on from states that are known already, the last of them in the body."""
@@ -152,15 +152,15 @@ class Clamping:
         scene, model = self.model.scene, self.model
         self.use_terms(closing=False)
         x = closed_tube(model.mesh, scene.mesh, scene.artery) if guess is None else guess.x
-        self.system.length = float(jnp.max(x[:, 1]))
-        far = jnp.full(len(RIGID), self.far, float)
+        self.system.length = float(np.max(np.asarray(x)[:, 1]))
+        far = rigid(self.far)
         start = with_equilibrium_pressure(model.potential, x, far) if guess is None else guess
         step = Step(Held(self.far), 0.0, 1.0)
         try:
             equilibrium = newton(self.system, start, step)
         except NotConverged:
             equilibrium = self.solve_or_descend("load-free", start, step, "no load")
-        self.system.length = 0.5 * float(lumen_height(equilibrium.state.x, model.marks))
+        self.system.length = half_height(equilibrium.state.x, self.model.marks)
         self.keep("load-free", equilibrium, 1.0, f"lumen radius {self.system.length:.3f} mm")
         return equilibrium
 
@@ -185,7 +185,7 @@ class Clamping:
             if equilibrium.negative_pivots:
                 buckled = NotConverged("the artery loses stability: it buckles or bulges")
                 raise self.error("physiological", equilibrium, buckled)
-        radius = 0.5 * float(lumen_height(equilibrium.state.x, self.model.marks))
+        radius = half_height(equilibrium.state.x, self.model.marks)
         self.keep("physiological", equilibrium, 1.0, f"lumen radius {radius:.3f} mm")
         return equilibrium
 
@@ -208,7 +208,7 @@ class Clamping:
         move = FIRST_TOUCH * self.outer_radius
         while True:
             touch = self.outer_radius - move
-            start = dataclasses.replace(in_body.state, q=jnp.full(len(RIGID), touch, float))
+            start = dataclasses.replace(in_body.state, q=rigid(touch))
             load = f"first contact, jaw height {touch:.3f} mm"
             equilibrium = self.solve_or_descend("clamping", start, self.step(Held(touch)), load)
             beyond = self.distance(equilibrium) if self.share(equilibrium.state) > 1.0 else 0.0
@@ -305,7 +305,7 @@ class Clamping:
 
     def occlusion(self, state: State) -> float:
         """1 - lumen height over that in the body."""
-        return 1.0 - 0.5 * float(lumen_height(state.x, self.model.marks)) / self.lumen_radius
+        return 1.0 - half_height(state.x, self.model.marks) / self.lumen_radius
 
     def tell_closing(self, s: float, equilibrium: Equilibrium) -> None:
         """Keep a closing state and report it."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 
-from jaxclamp.fem.tube import angles, axial_fractions
+from jaxclamp.fem.tube import grid_lines
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 
@@ -30,11 +30,12 @@ def transferred(state: State, old: Model, new: Model) -> State:
     for layer, (first, last) in enumerate(new.mesh.layer_cells):
         start, end = old.mesh.layer_cells[layer]
         middles = _middles(old, layer)
-        means = np.asarray(state.p[0, start:end]).reshape([len(line) for line in middles])
+        means = np.asarray(state.p)[0, start:end].reshape([len(line) for line in middles])
         for axis, (known, wanted) in enumerate(zip(middles, _middles(new, layer), strict=True)):
             means = _linear(means, known, wanted, axis)
         modes[0, first:last] = means.ravel()
-    return State(x=jnp.asarray(positions.reshape(-1, 3)), p=jnp.asarray(modes), q=state.q)
+    x, p = jax.device_put((positions.reshape(-1, 3), modes))
+    return State(x=x, p=p, q=state.q)
 
 
 RADIAL = 2
@@ -43,11 +44,8 @@ RADIAL = 2
 def _lines(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Place of each axial, circumferential and radial grid line in the artery: the same on every mesh."""
     mesh, settings = model.mesh, model.scene.mesh
-    return (
-        np.asarray(axial_fractions(mesh, settings)),
-        np.asarray(angles(mesh, settings)),
-        np.asarray(mesh.node_layer) + mesh.node_fraction,
-    )
+    axial, around = jax.device_get(grid_lines(mesh, settings))
+    return axial, around, np.asarray(mesh.node_layer) + mesh.node_fraction
 
 
 def _middles(model: Model, layer: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -209,7 +209,8 @@ def _examined(result: Result, twin: Result | None) -> str | None:
         closed = clamp(twin.scene)
     except EquilibriumError:
         return branch
-    apart = float(np.max(np.abs(np.asarray(closed.states[-1].state.x - twin.states[-1].state.x))))
+    ends = [np.asarray(r.states[-1].state.x) for r in (closed, twin)]
+    apart = float(np.max(np.abs(ends[0] - ends[1])))
     if apart <= SAME * float(twin.final["lumen_width_mm"]):
         return branch
     forces = [f"{r.final['clamp_force_N']:.4g} N" for r in (closed, twin)]

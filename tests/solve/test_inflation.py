@@ -33,7 +33,7 @@ def test_moving_the_tube_keeps_its_volume():
     artery = jc.load_scene("human-lad").artery
     radii, heights = np.array([1.7, 2.0, 2.4]), np.array([0.0, 3.0, 7.0])
     x = jnp.asarray([[r * np.cos(0.4), r * np.sin(0.4), z] for r in radii for z in heights])
-    moved = np.asarray(inflated_positions(x, artery, 1.7, 2.5))
+    moved = np.asarray(inflated_positions(x, artery.axial_stretch, 1.7, 2.5))
     rings = np.hypot(moved[::3, 0], moved[::3, 1])
     assert rings[0] == pytest.approx(2.5, rel=1e-14)
     np.testing.assert_allclose(np.diff(rings**2) * artery.axial_stretch, np.diff(radii**2), rtol=1e-13)

@@ -42,7 +42,7 @@ def plot_sections(result: Clamped) -> Picture:
         right = figure.add_subplot(grid[row, 3 * column + 1])
         for side in (1, -1):
             _bar(left, side * height, side * 2.0 * up, across)
-            right.add_patch(
+            right.add_artist(
                 Polygon(
                     np.stack([outline[:, 0], side * (height + outline[:, 1])], axis=1),
                     facecolor=JAW,
@@ -74,7 +74,7 @@ def _largest(result: Clamped) -> tuple[float, float]:
 def _bar(axes: Axes, face: float, back: float, across: float) -> None:
     """The jaw in the cross-section at mid-length."""
     corners = [(-2 * across, face), (2 * across, face), (2 * across, back), (-2 * across, back)]
-    axes.add_patch(Polygon(corners, facecolor=JAW, edgecolor=JAW_EDGE, linewidth=0.9))
+    axes.add_artist(Polygon(corners, facecolor=JAW, edgecolor=JAW_EDGE, linewidth=0.9))
 
 
 def _cross_section(axes: Axes, layer: WholeGrid, number: int) -> None:
@@ -83,7 +83,7 @@ def _cross_section(axes: Axes, layer: WholeGrid, number: int) -> None:
     codes = [Outline.MOVETO, *[Outline.LINETO] * (len(inner) - 2), Outline.CLOSEPOLY]
     path = Outline(np.concatenate([outer, inner[::-1]]), codes * 2)
     fill, edge = layer_colour(number)
-    axes.add_patch(PathPatch(path, facecolor=fill, edgecolor=edge, linewidth=0.8))
+    axes.add_artist(PathPatch(path, facecolor=fill, edgecolor=edge, linewidth=0.8))
     _element_lines(axes, points, edge)
 
 
@@ -92,14 +92,14 @@ def _longitudinal_section(axes: Axes, layer: WholeGrid, number: int) -> None:
     for quarter in (1, 3):  # under the upper jaw and over the lower one
         points = layer.points[:, layer.line(quarter)][..., [2, 1]]
         band = np.concatenate([points[:, 0], points[::-1, -1]])
-        axes.add_patch(Polygon(band, facecolor=fill, edgecolor=edge, linewidth=0.8))
+        axes.add_artist(Polygon(band, facecolor=fill, edgecolor=edge, linewidth=0.8))
         _element_lines(axes, points, edge)
 
 
 def _element_lines(axes: Axes, points: np.ndarray, colour: str) -> None:
     """Lines between elements, faint; points: (along, through, 2)."""
     lines = [*points, *np.swapaxes(points, 0, 1)]
-    axes.add_collection(LineCollection(lines, colors=colour, linewidths=0.25, alpha=0.7))
+    axes.add_collection(LineCollection(lines, colors=colour, linewidths=0.25, alpha=0.7), autolim=False)
 
 
 def _frame(axes: Axes, half_width: float, half_height: float) -> None:
