@@ -18,6 +18,8 @@ from jaxclamp.show.console import as_json
 
 STUDY, ITERATIONS, LOCK = "study.json", "iterations.csv", ".study.lock"
 """names of the files in a study's folder"""
+REPORTED = ("report.html", "front.png", "profiles.png", "figures", "start", "best")
+"""what a study leaves beside them in the end"""
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -57,6 +59,12 @@ class Journal:
             if self.found is not None and not resume:
                 raise SceneError(
                     f"{folder} holds a study already: continue it with --resume, or take another folder"
+                )
+            foreign = next((name for name in (ITERATIONS, *REPORTED) if (folder / name).exists()), None)
+            if self.found is None and foreign is not None:
+                raise SceneError(
+                    f"{folder} holds {foreign}, which is of no study as far as {STUDY} tells and would be "
+                    "replaced: take another folder"
                 )
         except BaseException:
             self.close()

@@ -9,7 +9,7 @@ from typing import Any
 
 import jaxclamp as jc
 from jaxclamp import Measure, SceneError
-from jaxclamp.scenes.schema import shown
+from jaxclamp.scenes.schema import ONES_OWN, shown
 from jaxclamp.scenes.wording import did_you_mean, shortened
 from optimize.numbers import MOST, number
 
@@ -89,7 +89,8 @@ def read_measure(
         raise SceneError(f"{path}: expected a table with measure = one of {', '.join(known)}")
     key = table["measure"]
     if key not in known:
-        raise SceneError(f"{path}.measure = {shown(key)}: no such measure; {did_you_mean(key, list(known))}")
+        said = did_you_mean(key, list(known))
+        raise SceneError(f"{path}.measure = {shown(key)}: no such measure; {said} ({ONES_OWN})")
     chosen = known[key]
     given = {name: _READERS[name](table.get(name), f"{path}.{name}", layers) for name in chosen.arguments}
     allowed = ("measure", *chosen.arguments, *others)

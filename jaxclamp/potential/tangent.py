@@ -124,9 +124,9 @@ class Linearisation:
     """its derivative by the nodes, mN, (n_nodes, 3)"""
     residual: np.ndarray
     """d Pi/dx of the free degrees of freedom, pressures condensed, mN, (n_free,)"""
-    imbalance: float
-    """norm of the free forces at the *stored* pressures, mN: what a trial state is judged by, because
-    a step changes the stored pressures to first order only"""
+    missing: np.ndarray
+    """part of it that comes with condensing: forces of the pressures that the volumes ask for beyond the
+    *stored* ones, mN, (n_free,)"""
     reactions: float
     """norm of the forces on the supports, mN"""
     volume_error: float
@@ -143,6 +143,14 @@ class Linearisation:
     """smallest volume ratio at a point"""
     J_max: float
     """largest volume ratio at a point"""
+
+    @property
+    def imbalance(self) -> float:
+        """Norm of the free forces at the *stored* pressures, mN.
+
+        What a trial state is judged by, because a step changes the stored pressures to first order only.
+        """
+        return float(np.linalg.norm(self.residual - self.missing))
 
     @property
     def jaw_force(self) -> float:
@@ -319,7 +327,6 @@ def assemble(potential: Potential, pattern: Pattern, pieces: list[list[Any]]) ->
             stiffness += np.sum(cells.rigid_stiffness, axis=-1)
             for field, of_cells in zip(coupling, cells.coupling, strict=True):
                 _add(field, nodes, of_cells)
-    imbalance = np.linalg.norm((wall + loads).ravel()[free])
     residual = (wall + missing + loads).ravel()
     held = np.delete(residual, free)
     of_wall = [cells for cells in found if cells.J_range is not None]
@@ -329,7 +336,7 @@ def assemble(potential: Potential, pattern: Pattern, pieces: list[list[Any]]) ->
         wall_energy=sum(float(np.sum(cells.energy)) for cells in of_wall),
         wall_force=wall + missing,
         residual=residual[free],
-        imbalance=float(imbalance),
+        missing=missing.ravel()[free],
         reactions=float(np.linalg.norm(held)),
         volume_error=float(np.max(np.concatenate([cells.volume_error for cells in of_wall]))),
         values=values,

@@ -27,6 +27,7 @@ MOST_ITEMS = 200
 """longest list of numbers or of layers"""
 LONGEST_TEXT = 200
 """characters of a title or a name"""
+ONES_OWN = "one of your own is known once its file is imported: --import FILE, or jaxclamp.import_parts"
 
 
 def refuse(path: str, value: Any, expected: str, choices: Sequence[str] = ()) -> BadKey:
@@ -146,7 +147,8 @@ def _tagged(base: type, table: dict[str, Any], path: str) -> type:
         raise BadKey(f"{join(path, tag)} is missing: expected one of {_listed(known)}")
     chosen = table[tag]
     if not isinstance(chosen, str) or chosen not in known:
-        raise refuse(join(path, tag), chosen, f"one of {_listed(known)}", list(known))
+        refused = refuse(join(path, tag), chosen, f"one of {_listed(known)}", list(known))
+        raise refused if nearest(str(chosen), list(known)) else BadKey(f"{refused} ({ONES_OWN})")
     return known[chosen]
 
 

@@ -31,6 +31,12 @@ from jaxclamp.solve.stops import Held
 
 MAX_DESCENT = 150
 MAX_SHIFTS = 30
+LEAST_SHIFT = 1e-4
+"""of the tangent, as part of the median of its diagonal"""
+MAX_CORRECTIONS = 3
+"""of the cells' volumes, after each step"""
+VOLUMES_KEPT = 0.1
+"""forces of wrong volumes that are left alone, as part of the others"""
 SUFFICIENT_FALL = 1e-4
 GOOD_MODEL = 0.3
 EASY_BULK, EASY_CONTACT = 400.0, 100.0
@@ -52,12 +58,13 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
     lin = system.linearise(state, step.pressure)
     if not sound(lin):
         raise NotConverged("the predicted state is inverted", residual_norm(lin), float(lin.J_min))
-    unit = 1e-3 * float(np.median(lin.values[system.pattern.diagonal]))
+    unit = LEAST_SHIFT * float(np.median(lin.values[system.pattern.diagonal]))
     shift, unstable = 0.0, False
     for iteration in range(MAX_DESCENT):
         if converged(system, state, lin, 0.0):
             equilibrium = newton(system, state, step)
             return dataclasses.replace(equilibrium, iterations=iteration, snapped=unstable)
+        eased = 0.25  # how much less of a shift comes next: not so little as has just been refused
         for _ in range(MAX_SHIFTS):
             dx = _downhill_step(system, lin, shift)
             if dx is None:
@@ -66,11 +73,11 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
                 trial, trial_lin, quality = _go_down(system, state, lin, step.pressure, dx)
                 if quality > 0.0:
                     break
-            shift = max(4.0 * shift, unit)
+            shift, eased = max(4.0 * shift, unit), 0.6
         else:
             break
         if quality > GOOD_MODEL:
-            shift = 0.25 * shift if shift > unit else 0.0
+            shift = eased * shift if shift > unit else 0.0
         state, lin = trial, trial_lin
     raise NotConverged("the way downhill did not end", residual_norm(lin), float(lin.J_min))
 
@@ -168,8 +175,35 @@ def _go_down(
     trial_lin = system.linearise(trial, pressure)
     if not sound(trial_lin):
         return state, lin, -1.0
+    trial, trial_lin = _with_their_volumes(system, trial, trial_lin, pressure)
     if residual_norm(trial_lin) < 0.3 * residual_norm(lin):
         return trial, trial_lin, 1.0
     predicted = -float(np.dot(lin.residual, dx)) * fraction
     fall = float(lin.energy) - float(trial_lin.energy)
     return trial, trial_lin, fall / predicted - SUFFICIENT_FALL
+
+
+def _with_their_volumes(
+    system: System, state: State, lin: Linearisation, pressure: float
+) -> tuple[State, Linearisation]:
+    """A trial state moved so that its cells have the volumes that their stored pressures ask for.
+
+    A step changes them to second order. Times the bulk modulus, that hides how far the potential falls along
+    a soft direction, and only tiny steps would be taken there. Corrections with the factors at hand: the
+    second-order correction of sequential quadratic programming (Nocedal and Wright, Numerical Optimization,
+    2nd ed., 15.6 and 18.3).
+    """
+    for _ in range(MAX_CORRECTIONS):
+        off = float(np.linalg.norm(lin.missing))
+        if off <= VOLUMES_KEPT * lin.imbalance:
+            break
+        try:
+            back = system.solver.solve(-lin.missing[:, None])[:, 0]
+        except Singular:
+            break
+        moved_back = advance(system.potential, state, back, np.zeros(len(state.q)), 1.0)
+        there = system.linearise(moved_back, pressure)
+        if not sound(there) or float(np.linalg.norm(there.missing)) > 0.5 * off:
+            break
+        state, lin = moved_back, there
+    return state, lin

@@ -196,6 +196,7 @@ def _kept(group: Any, models: list[Model]) -> Kept:
     lin = {
         "wall_force": (n_x, 3),
         "residual": (n_free,),
+        "missing": (n_free,),
         "values": (len(model.pattern.indices),),
         "rigid_force": (n_q,),
         "coupling": (n_free, n_q),

@@ -15,6 +15,7 @@ from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model, build_model, same_kind
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import ANOTHER, CLOSING_PATH, FOLLOWED, require_same_path
+from jaxclamp.solve.descent import descend
 from jaxclamp.solve.follow import stretched
 from jaxclamp.solve.newton import Equilibrium, Step, newton, predict
 from jaxclamp.solve.results import Kept, Result
@@ -137,7 +138,8 @@ def _follow_to_stop(
             if carried_over:
                 clamping.use(build_model(guess.scene, target))
                 try:
-                    last = clamping.settle(last.state, clamping.step(Held(float(last.state.jaw_height))))
+                    held = clamping.step(Held(float(last.state.jaw_height)))
+                    last = descend(clamping.system, last.state, held)
                 except NotConverged:
                     break
                 carried_over = False

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from jaxclamp.core.failures import EquilibriumError, NoReference, SceneError, TooLittleMemory
-from jaxclamp.core.parts import by_value
+from jaxclamp.core.parts import by_value, own_parts
 from jaxclamp.core.progress import Progress
 from jaxclamp.fem.landmarks import layer_of_P
 from jaxclamp.observe.measures import smooth_peak_axial_stress
@@ -274,6 +274,8 @@ class PriceList:
     """the reference: extrapolated over meshes, less what the penalties add"""
     sources: dict[str, dict[str, float | None]]
     """of the scene itself: signed error of each figure by source"""
+    own_parts: list[dict[str, str | None]] = dataclasses.field(default_factory=list)
+    """laws, jaws and stops of a user's own, with the digests of their files"""
 
     def error(self, price: Price, key: str) -> float | None:
         """Relative error of a figure of a variant."""
@@ -298,6 +300,7 @@ class PriceList:
             "title": self.title,
             "machine": machine(),
             "versions": versions(),
+            "own_parts": self.own_parts,
             "reference": {
                 key: {"exact": self.exact[key], "limit_of_meshes": dataclasses.asdict(limit)}
                 for key, limit in self.limits.items()
@@ -342,4 +345,4 @@ def price_list(scene: Scene, progress: Callable[[Progress], Any] | None = None) 
         key: limit.value - sum(sources.get(key, {}).get(name) or 0.0 for name in SOURCES[1:])
         for key, limit in limits.items()
     }
-    return PriceList(scene.title, inner_layer(scene), prices, limits, exact, sources)
+    return PriceList(scene.title, inner_layer(scene), prices, limits, exact, sources, own_parts(scene))

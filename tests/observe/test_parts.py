@@ -335,6 +335,16 @@ def test_a_bad_file_is_one_sentence_and_leaves_nothing(folder, capsys, name):
     assert {n for n in set(sys.modules) - modules if n.startswith("others")} == set()
 
 
+@pytest.mark.parametrize("key", ["clamp.jaw.shape", "artery.layers[0].material.law"])
+def test_what_nobody_knows_may_be_ones_own(key):
+    with pytest.raises(
+        jc.SceneError, match=r"expected one of .* \(one of your own is known once .*--import FILE"
+    ):
+        jc.load_scene("human-lad", [f"{key}=qqqq"])
+    with pytest.raises(jc.SceneError, match=r"did you mean [a-z]+\?$"):  # a slip of the pen is none
+        jc.load_scene("human-lad", [f"{key}={'cylindr' if 'jaw' in key else 'ngh'}"])
+
+
 def test_a_law_of_a_script_without_moduli_is_refused():
     @jc.record
     class Bare(jc.Material):

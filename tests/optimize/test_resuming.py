@@ -266,3 +266,11 @@ def test_other_versions_are_told_once_and_not_refused(asked, tmp_path, versions,
     )
     assert said is None or said in heard[0].message
     assert all(len(event.message) < 500 for event in heard)
+
+
+@pytest.mark.parametrize("name", ["iterations.csv", "report.html", "figures", "best"])
+def test_what_is_of_no_study_is_not_replaced(tmp_path, name):
+    (tmp_path / name).mkdir() if "." not in name else (tmp_path / name).write_text("mine", encoding="utf-8")
+    with pytest.raises(jc.SceneError, match=f"holds {name}, which is of no study .*: take another folder$"):
+        Journal(tmp_path, resume=True)
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name != ".study.lock") == [name]

@@ -56,6 +56,7 @@ def listed() -> PriceList:
         dict.fromkeys(keys, limit),
         dict.fromkeys(keys, 10.0),
         dict.fromkeys(keys, source),
+        [{"part": "Soft", "from": "parts.py", "sha256": "0" * 64}],
     )
 
 
@@ -80,6 +81,7 @@ def test_tables_and_files(tmp_path):
     written = json.loads((tmp_path / "new" / "accuracy.json").read_text())
     reference = written["reference"]["physiological.lumen_radius_mm"]
     assert reference["exact"] == 10.0
+    assert written["own_parts"] == prices.own_parts
     assert reference["limit_of_meshes"]["order"] == pytest.approx(2.0)
     assert written["front"]["physiological.lumen_radius_mm"] == ["mesh: coarse", "mesh: fine"]
     assert (tmp_path / "new" / "accuracy.png").read_bytes().startswith(b"\x89PNG")
