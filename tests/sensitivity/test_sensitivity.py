@@ -240,7 +240,7 @@ def test_an_old_equilibrium_is_not_mistaken_for_another():
 @pytest.mark.slow
 def test_tube_radius_against_the_differentiated_theory():
     """The gradient of the inflated tube's radius, and differences of the semi-analytic radius."""
-    scene = tube_scene(RING, 13.33, 1.1, mesh("q2p1", 6, 1, (4,)))
+    scene = tube_scene(RING, 13.33, 1.1, mesh("q2p1", 6, 2, (4,)))
     _, gradient = jax.value_and_grad(jc.evaluate)(tight(scene), jc.physiological_lumen_radius())
     material, layer = gradient.artery.layers[0].material, gradient.artery.layers[0]
     found = {

@@ -181,7 +181,10 @@ def errors_of_differences(result: jc.Result) -> dict[str, float]:
     ],
 )
 def test_gradients_of_jaw_and_contact(name):
-    result = jc.clamp(tight(solved(name).scene))
+    scene = tight(solved(name).scene)
+    # contact as sharp as is accepted leaves no room for a difference
+    inside = 1.0 + 2.0 * max(STEPS)
+    result = jc.clamp(jc.replace(scene, "contact.smoothing", inside * float(scene.contact.smoothing)))
     errors = errors_of_differences(result)
     assert all(error < 1e-3 for error in errors.values()), errors
 

@@ -8,6 +8,7 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.physics.jaws import Cylinder, Flat, Jaw
+from jaxclamp.solve.limits import LARGEST_SINKING
 from walks import mesh
 
 MESHES = {"10x15x8": (10, 15, (5, 3)), "10x30x8": (10, 30, (5, 3)), "20x30x16": (20, 30, (10, 6))}
@@ -35,7 +36,10 @@ def assert_closed(result: jc.Result) -> None:
     """At the stop, in balance, nothing inverted, nothing pushed through the jaw, energy accounted for."""
     final = result.final
     assert final["occlusion"] == pytest.approx(0.925, abs=1e-6)
-    assert final["max_penetration_mm"] < 0.1
+    # contact is a penalty; a narrow, sharp edge on a coarse mesh sinks in by a fifth of the wall
+    body = result.physiological.values
+    wall = body["outer_radius_mm"] - 0.5 * body["lumen_height_mm"]
+    assert final["max_penetration_mm"] < 0.5 * LARGEST_SINKING * wall
     for record in result.history:
         assert record["force_balance_error"] < 1e-6
         assert record["J_min"] > 0.0
