@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from jaxclamp.pictures.plots.accuracy import Panel, plot_prices
-from jaxclamp.pictures.plots.style import png
+from jaxclamp.pictures.plots.style import png, svg
 from jaxclamp.show.console import as_json, name_and_unit
 from jaxclamp.show.export import STAGING, into_place
 from jaxclamp.solve.results import versions
@@ -144,12 +144,14 @@ def _numbers(prices: PriceList, price: Price) -> dict[str, float]:
 
 
 def write_prices(prices: PriceList, folder: Path) -> list[Path]:
-    """accuracy.md, .csv, .json and .png in a folder, whole or not at all. Raises OSError."""
+    """accuracy.md, .csv, .json, .png and .svg in a folder, whole or not at all. Raises OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=STAGING, dir=folder) as staging:
         place = Path(staging)
         (place / "accuracy.md").write_text(markdown(prices), encoding="utf-8")
         (place / "accuracy.csv").write_text(csv_text(prices), encoding="utf-8", newline="")
         (place / "accuracy.json").write_text(as_json(prices.to_dict()) + "\n", encoding="utf-8")
-        (place / "accuracy.png").write_bytes(png(plot_prices(panels(prices))))
+        figure = plot_prices(panels(prices))
+        (place / "accuracy.png").write_bytes(png(figure))
+        (place / "accuracy.svg").write_bytes(svg(figure))
         return into_place(place, folder, sorted(place.iterdir()))

@@ -74,7 +74,7 @@ def test_tables_and_files(tmp_path):
     assert any("bulk x 100: no equilibrium" in line for line in lines(prices))
     assert "| mesh | fine | 8 | 5.00 | 500 | 1.00%* | 1.00%* |" in markdown(prices)
     names = {path.name for path in write_prices(prices, tmp_path / "new")}
-    assert names == {"accuracy.md", "accuracy.csv", "accuracy.json", "accuracy.png"}
+    assert names == {"accuracy.md", "accuracy.csv", "accuracy.json", "accuracy.png", "accuracy.svg"}
     table = list(csv.DictReader(io.StringIO((tmp_path / "new" / "accuracy.csv").read_text())))
     assert float(table[1]["error of physiological.lumen_radius_mm"]) == pytest.approx(0.01)
     assert table[3]["seconds"] == "nan"
