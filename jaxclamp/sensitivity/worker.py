@@ -4,10 +4,10 @@ JAX must not be called from inside one of its own callbacks: it may wait for its
 compiled program that needs an equilibrium has it solved here. The process starts afresh; jaws and laws of a
 script or a notebook travel with their scene.
 
-It has a pipe of its own because the processes of libraries do not do, and `jax.jit` has to work in any script:
-a fork of a process that has used JAX hangs; one that `multiprocessing` or `concurrent.futures` spawns runs the
-user's script again, which has to be guarded by `if __name__ == "__main__"` then; loky's tracker of resources
-(tried, 3.7) imports from the current folder, where a file may be called like a module of Python's.
+It has a pipe of its own because `jax.jit` has to work in any script, and the processes of libraries do not:
+a fork of a process that has used JAX hangs; one that `multiprocessing` or `concurrent.futures` spawns runs
+the user's script again, which has to be guarded by `if __name__ == "__main__"` then; loky's tracker of
+resources (tried, 3.7) imports from the current folder, where a file may be called like a module of Python's.
 """
 
 from __future__ import annotations
