@@ -38,7 +38,10 @@ MAX_CORRECTIONS = 3
 VOLUMES_KEPT = 0.1
 """forces of wrong volumes that are left alone, as part of the others"""
 SUFFICIENT_FALL = 1e-4
-GOOD_MODEL = 0.3
+NOISE = 1e-12
+"""of the potential, as part of itself"""
+POOR_MODEL, GOOD_MODEL = 0.25, 0.6
+"""a potential that falls by less or more of what its quadratic model says asks for more or less of a shift"""
 EASY_BULK, EASY_CONTACT = 400.0, 100.0
 """bulk modulus, and contact stiffness times the wall's thickness, over its shear modulus, with which the
 way downhill is easy"""
@@ -70,7 +73,7 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
             if dx is None:
                 unstable = True
             else:
-                trial, trial_lin, quality = _go_down(system, state, lin, step.pressure, dx)
+                trial, trial_lin, quality = _go_down(system, state, lin, step.pressure, dx, shift)
                 if quality > 0.0:
                     break
             shift, eased = max(4.0 * shift, unit), 0.6
@@ -78,6 +81,8 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
             break
         if quality > GOOD_MODEL:
             shift = eased * shift if shift > unit else 0.0
+        elif quality < POOR_MODEL:
+            shift = max(2.0 * shift, unit)
         state, lin = trial, trial_lin
     raise NotConverged("the way downhill did not end", residual_norm(lin), float(lin.J_min))
 
@@ -163,11 +168,11 @@ def _downhill_step(system: System, lin: Linearisation, shift: float) -> np.ndarr
 
 
 def _go_down(
-    system: System, state: State, lin: Linearisation, pressure: float, dx: np.ndarray
+    system: System, state: State, lin: Linearisation, pressure: float, dx: np.ndarray, shift: float
 ) -> tuple[State, Linearisation, float]:
     """Go along a downhill step; how well the fall agrees with the prediction, 0 or less if refused.
 
-    Close to equilibrium, where the fall drowns in rounding, a smaller residual is accepted instead.
+    Close to equilibrium, where the fall drowns in rounding, a smaller residual counts instead.
     """
     system.newton_iterations += 1
     fraction = min(1.0, LARGEST_MOVE * system.length / float(np.max(np.abs(dx))))
@@ -176,11 +181,14 @@ def _go_down(
     if not sound(trial_lin):
         return state, lin, -1.0
     trial, trial_lin = _with_their_volumes(system, trial, trial_lin, pressure)
-    if residual_norm(trial_lin) < 0.3 * residual_norm(lin):
+    along = -float(np.dot(lin.residual, dx))
+    curved = along - shift * float(np.dot(dx, dx))  # dx' K dx
+    predicted = fraction * along - 0.5 * fraction**2 * curved
+    better = residual_norm(trial_lin) < 0.3 * residual_norm(lin)
+    if better and predicted < NOISE * abs(float(lin.energy)):
         return trial, trial_lin, 1.0
-    predicted = -float(np.dot(lin.residual, dx)) * fraction
-    fall = float(lin.energy) - float(trial_lin.energy)
-    return trial, trial_lin, fall / predicted - SUFFICIENT_FALL
+    quality = (float(lin.energy) - float(trial_lin.energy)) / predicted - SUFFICIENT_FALL
+    return trial, trial_lin, max(quality, POOR_MODEL) if better else quality
 
 
 def _with_their_volumes(

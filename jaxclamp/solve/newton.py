@@ -26,6 +26,8 @@ from jaxclamp.solve.stops import Condition, Row
 MAX_NEWTON = 14
 MAX_CUTS = 2
 DIVERGING = 4.0
+MAX_IDLE = 4
+"""iterations in which the imbalance is not halved: at a fold that turns soft, Newton's method goes in circles"""
 MAX_LINEARISATIONS = 3000
 """a clamping that needs more is given up, so that nothing runs for ever"""
 LARGEST_MOVE = 0.25
@@ -216,7 +218,7 @@ def newton(
     lin = system.linearise(state, pressure) if reuse is None else reuse.lin
     if not sound(lin):
         raise NotConverged("the predicted state is inverted", residual_norm(lin), float(lin.J_min))
-    cuts, first_imbalance = 0, math.inf
+    cuts, first_imbalance, least, idle = 0, math.inf, math.inf, 0
     for iteration in range(MAX_NEWTON + 1):
         row = closing.row(state, n_free)
         negative, responses = (
@@ -234,8 +236,11 @@ def newton(
         cuts += shortened
         imbalance = float(lin.imbalance)
         first_imbalance = imbalance if iteration == 0 else first_imbalance
+        least, idle = (imbalance, 0) if imbalance < 0.5 * least else (least, idle + 1)
         if iteration > 2 and imbalance > DIVERGING * first_imbalance:
             raise NotConverged("Newton's residual grows", residual_norm(lin), float(lin.J_min))
+        if idle > MAX_IDLE:
+            raise NotConverged("Newton's method goes in circles", residual_norm(lin), float(lin.J_min))
     raise NotConverged(
         f"Newton's method goes on beyond {MAX_NEWTON} iterations", residual_norm(lin), float(lin.J_min)
     )
