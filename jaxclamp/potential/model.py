@@ -120,7 +120,7 @@ def _sides(mesh: Mesh, settings: MeshSettings) -> dict[str, np.ndarray]:
 
 def potential_of(scene: Scene, discretisation: Discretisation) -> Potential:
     """The potential of a scene with all its terms; a JAX function of every float in it."""
-    return _potential(_terms, scene, discretisation)
+    return _potential(_terms_in_a_program, scene, discretisation)
 
 
 def _potential(terms: Terms, scene: Scene, d: Discretisation) -> Potential:
@@ -136,6 +136,7 @@ def _terms(
 
 
 Terms = Callable[[Artery, Clamp, Contact, MeshSettings, Discretisation], tuple[Term | Volume, ...]]
+_terms_in_a_program = jax.jit(_terms)
 # called once for a scene, it is compiled for a short compilation rather than for speed
 _terms_of_a_scene = jax.jit(_terms, compiler_options={"xla_backend_optimization_level": 0})
 

@@ -27,7 +27,7 @@ MAX_NEWTON = 14
 MAX_CUTS = 2
 DIVERGING = 4.0
 MAX_IDLE = 4
-"""iterations in which the imbalance is not halved: at a fold that turns soft, Newton's method goes in circles"""
+"""iterations without halving the imbalance: where a fold turns soft, Newton's method goes in circles"""
 MAX_LINEARISATIONS = 3000
 """a clamping that needs more is given up, so that nothing runs for ever"""
 LARGEST_MOVE = 0.25

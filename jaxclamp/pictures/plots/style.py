@@ -43,7 +43,8 @@ class Picture(Figure):
 def png(figure: Figure, dots_per_inch: int = DOTS_PER_INCH) -> bytes:
     """The figure as a PNG file."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dots_per_inch, metadata={"Software": None})
+    quick = {"compress_level": 3}  # a quarter of a second less for all figures of a run, a tenth larger
+    figure.savefig(buffer, format="png", dpi=dots_per_inch, metadata={"Software": None}, pil_kwargs=quick)
     return buffer.getvalue()
 
 
