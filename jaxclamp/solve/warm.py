@@ -15,7 +15,7 @@ from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model, build_model, same_kind
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.branch import ANOTHER, CLOSING_PATH, FOLLOWED, require_same_path
-from jaxclamp.solve.descent import descend
+from jaxclamp.solve.descent import descend_eased, ease_of
 from jaxclamp.solve.follow import stretched
 from jaxclamp.solve.newton import Equilibrium, Step, newton, predict
 from jaxclamp.solve.results import Kept, Result
@@ -139,7 +139,7 @@ def _follow_to_stop(
                 clamping.use(build_model(guess.scene, target))
                 try:
                     held = clamping.step(Held(float(last.state.jaw_height)))
-                    last = descend(clamping.system, last.state, held)
+                    last = descend_eased(clamping.system, last.state, held, ease_of(guess.scene))
                 except NotConverged:
                     break
                 carried_over = False
