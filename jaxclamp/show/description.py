@@ -13,7 +13,7 @@ from jaxclamp.scenes.fitting import fitting_contact
 from jaxclamp.scenes.notes import notes
 from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.linear_solvers import available
-from jaxclamp.solve.memory import predicted_MB, unknowns_of
+from jaxclamp.solve.memory import coarser_unknowns, predicted_MB, unknowns_of
 
 USUAL_ITERATIONS = 90
 """Newton iterations of a whole clamping, on any mesh"""
@@ -47,7 +47,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "continuation": solver.continuation,
         "linear_solver": available(unknowns)[0] if solver.linear_solver == "auto" else solver.linear_solver,
         "predicted_seconds": _rounded(seconds),
-        "predicted_memory_MB": _rounded(predicted_MB(unknowns)),
+        "predicted_memory_MB": _rounded(predicted_MB(unknowns, coarser_unknowns(scene.mesh))),
         "warnings": warnings(scene),
         "notes": notes(scene),
     }

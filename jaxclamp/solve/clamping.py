@@ -18,7 +18,7 @@ from jaxclamp.solve.branch import CLOSING_PATH, branch_of
 from jaxclamp.solve.easing import keep_hardened, with_softer_contact
 from jaxclamp.solve.gaps import require_a_gap
 from jaxclamp.solve.linear_solvers import Factors
-from jaxclamp.solve.memory import require_memory, unknowns_of
+from jaxclamp.solve.memory import coarser_unknowns, require_memory, unknowns_of
 from jaxclamp.solve.nested import NEAR, to_walk_on
 from jaxclamp.solve.results import Kept, Result, work_balance
 from jaxclamp.solve.stages import Clamping
@@ -56,7 +56,8 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
     start = time.perf_counter()
     require_computable(scene)
     if (unknowns := unknowns_of(scene.mesh)) > (0 if guess is None else guess.model.pattern.n):
-        require_memory(unknowns)  # a guess of as many is proof that they fit
+        # a guess of as many is proof that they fit
+        require_memory(unknowns, coarser_unknowns(scene.mesh))
     if to_stop:
         require_a_gap(scene)
     model = build_model(scene, None if guess is None else guess.model)

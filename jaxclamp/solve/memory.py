@@ -8,10 +8,12 @@ from jaxclamp.core.failures import TooLittleMemory
 from jaxclamp.core.memory import ADDRESSES, limits_MB, resident_MB
 from jaxclamp.fem.tube import build_tube, supports
 from jaxclamp.scenes.scene import MeshSettings, Scene
+from jaxclamp.solve.nested import LEAST_CELLS, cells, coarser
 
-START, PER_UNKNOWN = 850.0, 0.03
-"""MB: Python with its compiled programs and the error estimates, and what each unknown adds (human-lad on
-meshes of 500 to 31,000 unknowns, q1p0 and q2p1: 833 to 1758 MB, within 12 %)"""
+START, PER_UNKNOWN = 850.0, 0.025
+"""MB: Python with its compiled programs and the error estimates, and what each unknown adds, those of the
+coarser meshes of the closing path counted (human-lad on meshes of 31,000, 103,000, 241,000 unknowns: 1.8 to
+2.0, 3.8 and 10.2 GB, predicted 1.8, 4.3 and 10.4)"""
 ADDRESSES_PER_MB, ADDRESSES_PER_UNKNOWN, ADDRESSES_EXPONENT = 1.2, 5e-4, 1.5
 """addresses taken, MB: for each MB of memory, and factor times unknowns to the exponent (the same runs:
 694 MB on the smallest mesh, 757 on 9,600 unknowns, 4048 on the largest; never less than they took)"""
@@ -22,22 +24,32 @@ def unknowns_of(mesh: MeshSettings) -> int:
     return int(np.sum(~supports(build_tube(mesh), mesh)))
 
 
-def predicted_MB(unknowns: int) -> float:
-    """Largest memory of a process that solves one scene, with the errors of its figures."""
-    return START + PER_UNKNOWN * unknowns
+def coarser_unknowns(mesh: MeshSettings) -> int:
+    """Those of all coarser meshes on which the closing path is walked."""
+    coarse = coarser(mesh)[0]
+    return unknowns_of(coarse) + coarser_unknowns(coarse) if cells(coarse) >= LEAST_CELLS else 0
 
 
-def require_memory(unknowns: int, processes: int = 1) -> None:
+def predicted_MB(unknowns: int, of_coarser: int = 0) -> float:
+    """Largest memory of a process that solves one scene, with the errors of its figures.
+
+    of_coarser: unknowns of its coarser meshes
+    """
+    return START + PER_UNKNOWN * (unknowns + of_coarser)
+
+
+def require_memory(unknowns: int, of_coarser: int = 0, processes: int = 1) -> None:
     """Raise TooLittleMemory if a scene with so many unknowns will not fit, as far as that is known.
 
-    processes: this one and others, a study's starts, that solve such scenes at the same time; a limit on
-        addresses is one for each
+    of_coarser: unknowns of its coarser meshes; processes: this one and others, a study's starts, that solve
+        such scenes at the same time; a limit on addresses is one for each
     """
     taken = resident_MB()
     if taken is None:
         return
-    alone = max(predicted_MB(unknowns) - taken, 0.0)
-    together = alone + (processes - 1) * predicted_MB(unknowns)
+    whole = predicted_MB(unknowns, of_coarser)
+    alone = max(whole - taken, 0.0)
+    together = alone + (processes - 1) * whole
     addresses = ADDRESSES_PER_MB * alone + ADDRESSES_PER_UNKNOWN * unknowns**ADDRESSES_EXPONENT
     for left, by in limits_MB():
         more = (addresses if alone else 0.0) if by == ADDRESSES else together
@@ -55,4 +67,4 @@ def require_memory(unknowns: int, processes: int = 1) -> None:
 
 def require_memory_for(scene: Scene, processes: int) -> None:
     """Raise TooLittleMemory if so many processes that solve a scene at the same time will not fit."""
-    require_memory(unknowns_of(scene.mesh), processes)
+    require_memory(unknowns_of(scene.mesh), coarser_unknowns(scene.mesh), processes)
