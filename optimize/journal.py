@@ -48,6 +48,7 @@ class Journal:
     def __init__(self, folder: Path, resume: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
+        known = (folder / LOCK).exists()
         self._lock = FileLock(folder / LOCK)
         try:
             self._lock.acquire(timeout=0)
@@ -61,10 +62,10 @@ class Journal:
                     f"{folder} holds a study already: continue it with --resume, or take another folder"
                 )
             foreign = next((name for name in (ITERATIONS, *REPORTED) if (folder / name).exists()), None)
-            if self.found is None and foreign is not None:
+            if self.found is None and foreign is not None and not known:
                 raise SceneError(
-                    f"{folder} holds {foreign}, which is of no study as far as {STUDY} tells and would be "
-                    "replaced: take another folder"
+                    f"{folder} holds {foreign} but no study, whose files would replace it: "
+                    "take another folder"
                 )
         except BaseException:
             self.close()

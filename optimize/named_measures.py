@@ -10,7 +10,7 @@ from typing import Any
 import jaxclamp as jc
 from jaxclamp import Measure, SceneError
 from jaxclamp.scenes.schema import ONES_OWN, shown
-from jaxclamp.scenes.wording import did_you_mean, shortened
+from jaxclamp.scenes.wording import did_you_mean, nearest, shortened
 from optimize.numbers import MOST, number
 
 FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
@@ -90,7 +90,8 @@ def read_measure(
     key = table["measure"]
     if key not in known:
         said = did_you_mean(key, list(known))
-        raise SceneError(f"{path}.measure = {shown(key)}: no such measure; {said} ({ONES_OWN})")
+        own = "" if nearest(key, list(known)) else f" ({ONES_OWN})"
+        raise SceneError(f"{path}.measure = {shown(key)}: no such measure; {said}{own}")
     chosen = known[key]
     given = {name: _READERS[name](table.get(name), f"{path}.{name}", layers) for name in chosen.arguments}
     allowed = ("measure", *chosen.arguments, *others)

@@ -28,13 +28,8 @@ class FacetRule:
         return self.surface[:, :1]
 
     @property
-    def N(self) -> np.ndarray:
-        """Shape functions, (n_q, n_fn)."""
-        return self.surface[:, 0]
-
-    @property
     def dN(self) -> np.ndarray:
-        """Their derivatives: the stencil of the tangents, (n_q, 2, n_fn)."""
+        """Stencil of the tangents, (n_q, 2, n_fn)."""
         return self.surface[:, 1:]
 
 

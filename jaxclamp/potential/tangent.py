@@ -150,7 +150,8 @@ class Linearisation:
 
         What a trial state is judged by, because a step changes the stored pressures to first order only.
         """
-        return float(np.linalg.norm(self.residual - self.missing))
+        with np.errstate(over="ignore", invalid="ignore"):  # a trial state may be absurd
+            return float(np.linalg.norm(self.residual - self.missing))
 
     @property
     def jaw_force(self) -> float:
@@ -197,15 +198,18 @@ def cut(group: Group, state: State) -> list[Piece]:
             found = a[..., first : first + group.size]
             return np.concatenate([found, *[found[..., -1:]] * missing], axis=-1) if missing else found
 
-        heres = jax.tree_util.tree_map(
-            lambda a: of(a) if np.ndim(a) > 1 and a.shape[-1] == n else a, cells.heres
-        )
+        heres = jax.tree_util.tree_map(lambda a: of(a) if is_of_cells(a, n) else a, cells.heres)
         pressures = cells.pressures
         if pressures is not None:
             pressures = dataclasses.replace(pressures, p=of(pressures.p), stiffness=of(pressures.stiffness))
         return dataclasses.replace(cells, x=of(cells.x), heres=heres, pressures=pressures)
 
     return [block(first) for first in range(0, n, group.size)]
+
+
+def is_of_cells(known: Any, n: int) -> bool:
+    """True for what each of n cells has for itself, last axis; the rest they share."""
+    return np.ndim(known) > 1 and np.shape(known)[-1] == n
 
 
 def joined(group: Group, blocks: list[Tree]) -> Tree:

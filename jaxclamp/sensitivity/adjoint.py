@@ -27,7 +27,7 @@ from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, positions, potential_of
-from jaxclamp.potential.tangent import Piece, cut, on_nodes, piece_energy, whole
+from jaxclamp.potential.tangent import Piece, cut, is_of_cells, on_nodes, piece_energy, whole
 from jaxclamp.potential.terms import Group, Potential
 from jaxclamp.scenes.scene import Scene, Stop
 from jaxclamp.sensitivity.implicit import Unknowns, contact_forces, solution, solve_linear
@@ -124,8 +124,12 @@ def _layer_work(group: Group, state: State, moves: State) -> Wall:
     for i, (cells, move) in enumerate(zip(cut(group, state), cut(group, moves), strict=True)):
         there = np.arange(i * size, (i + 1) * size) < n  # and not there to fill up a block
         parts.append(_piece_work(cells, move.x * there))
-    together = lambda *a: np.concatenate(a, axis=-1)[..., :n] if np.ndim(a[0]) > 1 else sum(a)  # noqa: E731
-    return jax.tree_util.tree_map(together, *jax.device_get(parts))
+
+    def together(known: Any, *found: Any) -> Any:
+        return np.concatenate(found, axis=-1)[..., :n] if is_of_cells(known, n) else sum(found)
+
+    uncut = _of_piece(whole(*jax.tree_util.tree_map(np.asarray, (group, state))))
+    return jax.tree_util.tree_map(together, uncut, *jax.device_get(parts))
 
 
 @jax.jit

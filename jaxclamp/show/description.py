@@ -47,7 +47,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "continuation": solver.continuation,
         "linear_solver": available(unknowns)[0] if solver.linear_solver == "auto" else solver.linear_solver,
         "predicted_seconds": _rounded(seconds),
-        "predicted_memory_MB": _rounded(predicted_MB(unknowns, coarser_unknowns(scene.mesh))),
+        "predicted_memory_MB": _rounded(predicted_MB(unknowns, coarser_unknowns(scene))),
         "warnings": warnings(scene),
         "notes": notes(scene),
     }

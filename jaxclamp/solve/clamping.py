@@ -57,7 +57,7 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
     require_computable(scene)
     if (unknowns := unknowns_of(scene.mesh)) > (0 if guess is None else guess.model.pattern.n):
         # a guess of as many is proof that they fit
-        require_memory(unknowns, coarser_unknowns(scene.mesh))
+        require_memory(unknowns, coarser_unknowns(scene) if to_stop and guess is None else 0)
     if to_stop:
         require_a_gap(scene)
     model = build_model(scene, None if guess is None else guess.model)

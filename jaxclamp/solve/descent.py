@@ -1,7 +1,7 @@
 """The way downhill: where the tangent is no longer definite and Newton cycles, at a held jaw.
 
-`descend` is a regularised Newton method on the potential that uses the inertia of the tangent, always goes
-down in energy, and therefore ends in a stable equilibrium.
+`descend` is a regularised Newton method on the potential that uses the inertia of the tangent, goes down in
+energy, and ends in a stable equilibrium.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ SUFFICIENT_FALL = 1e-4
 NOISE = 1e-12
 """of the potential, as part of itself"""
 POOR_MODEL, GOOD_MODEL = 0.25, 0.6
-"""a potential that falls by less or more of what its quadratic model says asks for more or less of a shift"""
+"""fall of the potential over that of its quadratic model: below the one the shift rises, above the other it
+shrinks"""
 EASY_BULK, EASY_CONTACT = 400.0, 100.0
 """bulk modulus, and contact stiffness times the wall's thickness, over its shear modulus, with which the
 way downhill is easy"""
@@ -67,7 +68,7 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
         if converged(system, state, lin, 0.0):
             equilibrium = newton(system, state, step)
             return dataclasses.replace(equilibrium, iterations=iteration, snapped=unstable)
-        eased = 0.25  # how much less of a shift comes next: not so little as has just been refused
+        refused = False
         for _ in range(MAX_SHIFTS):
             dx = _downhill_step(system, lin, shift)
             if dx is None:
@@ -76,11 +77,12 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
                 trial, trial_lin, quality = _go_down(system, state, lin, step.pressure, dx, shift)
                 if quality > 0.0:
                     break
-            shift, eased = max(4.0 * shift, unit), 0.6
+            shift, refused = max(4.0 * shift, unit), True
         else:
             break
         if quality > GOOD_MODEL:
-            shift = eased * shift if shift > unit else 0.0
+            less = 0.6 if refused else 0.25  # not so little as has just been refused
+            shift = less * shift if shift > unit else unit if refused else 0.0
         elif quality < POOR_MODEL:
             shift = max(2.0 * shift, unit)
         state, lin = trial, trial_lin
@@ -172,7 +174,8 @@ def _go_down(
 ) -> tuple[State, Linearisation, float]:
     """Go along a downhill step; how well the fall agrees with the prediction, 0 or less if refused.
 
-    Close to equilibrium, where the fall drowns in rounding, a smaller residual counts instead.
+    A residual of less than a third counts whatever the potential does: near equilibrium its fall drowns in
+    rounding, and before, the volumes of a good step may hide it.
     """
     system.newton_iterations += 1
     fraction = min(1.0, LARGEST_MOVE * system.length / float(np.max(np.abs(dx))))
@@ -208,6 +211,8 @@ def _with_their_volumes(
         try:
             back = system.solver.solve(-lin.missing[:, None])[:, 0]
         except Singular:
+            break
+        if float(np.max(np.abs(back))) > LARGEST_MOVE * system.length:
             break
         moved_back = advance(system.potential, state, back, np.zeros(len(state.q)), 1.0)
         there = system.linearise(moved_back, pressure)

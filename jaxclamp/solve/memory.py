@@ -8,15 +8,15 @@ from jaxclamp.core.failures import TooLittleMemory
 from jaxclamp.core.memory import ADDRESSES, limits_MB, resident_MB
 from jaxclamp.fem.tube import build_tube, supports
 from jaxclamp.scenes.scene import MeshSettings, Scene
-from jaxclamp.solve.nested import LEAST_CELLS, cells, coarser
+from jaxclamp.solve.nested import to_walk_on
 
 START, PER_UNKNOWN = 850.0, 0.025
 """MB: Python with its compiled programs and the error estimates, and what each unknown adds, those of the
 coarser meshes of the closing path counted (human-lad on meshes of 31,000, 103,000, 241,000 unknowns: 1.8 to
 2.0, 3.8 and 10.2 GB, predicted 1.8, 4.3 and 10.4)"""
 ADDRESSES_PER_MB, ADDRESSES_PER_UNKNOWN, ADDRESSES_EXPONENT = 1.2, 5e-4, 1.5
-"""addresses taken, MB: for each MB of memory, and factor times unknowns to the exponent (the same runs:
-694 MB on the smallest mesh, 757 on 9,600 unknowns, 4048 on the largest; never less than they took)"""
+"""addresses taken, MB: for each MB of memory, and factor times unknowns to the exponent (in a version before:
+694 MB on 500 unknowns, 757 on 9,600, 4048 on 31,000; never less than they took)"""
 
 
 def unknowns_of(mesh: MeshSettings) -> int:
@@ -24,10 +24,10 @@ def unknowns_of(mesh: MeshSettings) -> int:
     return int(np.sum(~supports(build_tube(mesh), mesh)))
 
 
-def coarser_unknowns(mesh: MeshSettings) -> int:
+def coarser_unknowns(scene: Scene) -> int:
     """Those of all coarser meshes on which the closing path is walked."""
-    coarse = coarser(mesh)[0]
-    return unknowns_of(coarse) + coarser_unknowns(coarse) if cells(coarse) >= LEAST_CELLS else 0
+    coarse = to_walk_on(scene)
+    return 0 if coarse is None else unknowns_of(coarse.mesh) + coarser_unknowns(coarse)
 
 
 def predicted_MB(unknowns: int, of_coarser: int = 0) -> float:
@@ -67,4 +67,4 @@ def require_memory(unknowns: int, of_coarser: int = 0, processes: int = 1) -> No
 
 def require_memory_for(scene: Scene, processes: int) -> None:
     """Raise TooLittleMemory if so many processes that solve a scene at the same time will not fit."""
-    require_memory(unknowns_of(scene.mesh), coarser_unknowns(scene.mesh), processes)
+    require_memory(unknowns_of(scene.mesh), coarser_unknowns(scene), processes)

@@ -27,7 +27,7 @@ MAX_NEWTON = 14
 MAX_CUTS = 2
 DIVERGING = 4.0
 MAX_IDLE = 4
-"""iterations without halving the imbalance: where a fold turns soft, Newton's method goes in circles"""
+"""whole steps without halving the imbalance: where a fold turns soft, Newton's method goes in circles"""
 MAX_LINEARISATIONS = 3000
 """a clamping that needs more is given up, so that nothing runs for ever"""
 LARGEST_MOVE = 0.25
@@ -231,16 +231,17 @@ def newton(
             return Equilibrium(
                 state, pressure, step.axial_stretch, lin, negative, slope, responses, iteration
             )
+        if idle > MAX_IDLE:
+            raise NotConverged("Newton's method goes in circles", residual_norm(lin), float(lin.J_min))
         system.newton_iterations += 1
         state, lin, shortened = _admissible(system, state, lin, pressure, dx, dq, MAX_CUTS - cuts)
         cuts += shortened
         imbalance = float(lin.imbalance)
         first_imbalance = imbalance if iteration == 0 else first_imbalance
-        least, idle = (imbalance, 0) if imbalance < 0.5 * least else (least, idle + 1)
+        whole = not shortened and _largest(dx, dq) <= LARGEST_MOVE * system.length
+        least, idle = (imbalance, 0) if imbalance < 0.5 * least else (least, idle + whole)
         if iteration > 2 and imbalance > DIVERGING * first_imbalance:
             raise NotConverged("Newton's residual grows", residual_norm(lin), float(lin.J_min))
-        if idle > MAX_IDLE:
-            raise NotConverged("Newton's method goes in circles", residual_norm(lin), float(lin.J_min))
     raise NotConverged(
         f"Newton's method goes on beyond {MAX_NEWTON} iterations", residual_norm(lin), float(lin.J_min)
     )

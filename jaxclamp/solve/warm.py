@@ -116,7 +116,7 @@ def _follow_to_stop(
 ) -> Equilibrium | None:
     """The state at the stop, followed from a neighbour's with as few scenes in between as it takes.
 
-    A state carried over from another mesh that is too far off is first settled under its own jaw.
+    A state carried over from another mesh that is too far off first goes downhill under its own jaw.
     """
     target, body = clamping.model, clamping.body
     assert guess.physiological is not None

@@ -271,6 +271,14 @@ def test_other_versions_are_told_once_and_not_refused(asked, tmp_path, versions,
 @pytest.mark.parametrize("name", ["iterations.csv", "report.html", "figures", "best"])
 def test_what_is_of_no_study_is_not_replaced(tmp_path, name):
     (tmp_path / name).mkdir() if "." not in name else (tmp_path / name).write_text("mine", encoding="utf-8")
-    with pytest.raises(jc.SceneError, match=f"holds {name}, which is of no study .*: take another folder$"):
+    with pytest.raises(jc.SceneError, match=f"holds {name} but no study, .*: take another folder$"):
         Journal(tmp_path, resume=True)
-    assert sorted(path.name for path in tmp_path.iterdir() if path.name != ".study.lock") == [name]
+    assert [path.name for path in tmp_path.iterdir() if path.name != ".study.lock"] == [name]
+
+
+def test_where_a_study_was_another_may_begin(asked, tmp_path):
+    """As is said of a damaged study.json: move that file away; its table and its reports stay behind."""
+    journalled(asked, tmp_path)
+    (tmp_path / "study.json").rename(tmp_path / "moved.json")
+    (tmp_path / "report.html").write_text("of the study before", encoding="utf-8")
+    Journal(tmp_path, resume=True).close()
