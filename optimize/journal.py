@@ -63,6 +63,8 @@ class Journal:
                 )
             foreign = next((name for name in (ITERATIONS, *REPORTED) if (folder / name).exists()), None)
             if self.found is None and foreign is not None and not known:
+                self.close()
+                (folder / LOCK).unlink(missing_ok=True)  # it would be taken for that of a study
                 raise SceneError(
                     f"{folder} holds {foreign} but no study, whose files would replace it: "
                     "take another folder"
