@@ -23,11 +23,12 @@ from jax import Array
 
 from jaxclamp.core.records import record
 from jaxclamp.fem.landmarks import Landmarks
+from jaxclamp.fem.pattern import Layout
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, positions, potential_of
-from jaxclamp.potential.tangent import Piece, cut, is_of_cells, on_nodes, piece_energy, whole
+from jaxclamp.potential.tangent import Piece, cut, is_of_cells, piece_energy, whole
 from jaxclamp.potential.terms import Group, Potential
 from jaxclamp.scenes.scene import Scene, Stop
 from jaxclamp.sensitivity.implicit import Unknowns, contact_forces, solution, solve_linear
@@ -81,11 +82,11 @@ def value_and_gradient(result: Result, measure: Measure) -> tuple[float, Scene]:
         ),
         transposed=True,
     )
-    y_body = on_nodes(d.layout, jnp.asarray(y.physiological))
+    y_body = _on_nodes(d.layout, y.physiological)
     work = [_wall_work(potential, base, y_body)]
     y_stop, y_q = None, at.q
     if to_stop:
-        y_stop, y_q = on_nodes(d.layout, jnp.asarray(y.stop)), jnp.asarray(y.q)
+        y_stop, y_q = _on_nodes(d.layout, y.stop), jnp.asarray(y.q)
         work.append(_wall_work(potential, last, y_stop))
     touch = _surface_work(potential, d.marks, at, y_body, y_stop, y_q)
     return float(value), _named(_by_scene(d, scene, slopes, touch, work), result.scene)
@@ -102,6 +103,13 @@ def _measured(measure: Measure, potential: Potential, marks: Landmarks, at: Size
         return measure(Equilibria(potential=same, marks=marks, states=(in_body, *closed)))
 
     return jax.value_and_grad(of)(at)
+
+
+def _on_nodes(layout: Layout, v: Any) -> Any:
+    """Unknowns (n_free,) as a field (n_nodes, 3), zero where nodes are held, on the host."""
+    field = np.zeros(3 * layout.n_nodes)
+    field[np.asarray(layout.free)] = v
+    return field.reshape(-1, 3)
 
 
 Wall = tuple[Array, tuple[Any, ...], Array]
@@ -216,7 +224,7 @@ def value_and_clamp_gradient(result: Result, measure: Measure) -> tuple[float, S
         nothing = jax.tree_util.tree_map(jnp.zeros_like, at)
         return float(value), _named(_by_clamp(d, scene, slopes, nothing), result.scene)
     y = solve_linear(known, Unknowns(physiological=None, stop=right, q=by_q), transposed=True)
-    y_stop = on_nodes(d.layout, jnp.asarray(y.stop))
+    y_stop = _on_nodes(d.layout, y.stop)
     touch = _clamp_work(potential, d.marks, at, y_stop, jnp.asarray(y.q))
     return float(value), _named(_by_clamp(d, scene, slopes, touch), result.scene)
 
