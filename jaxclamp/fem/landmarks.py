@@ -26,6 +26,8 @@ class Landmarks:
     """its mirror image, where that is modelled"""
     lumen_ring: np.ndarray
     """inner surface at mid-length, round the modelled part (closed where it wraps), (n,)"""
+    lumen_line: np.ndarray
+    """inner surface on the compression axis, along the modelled part, (n,)"""
     outer_top: int = static()
     """outer surface, compression axis, mid-length"""
     P_layer: int = static()
@@ -80,6 +82,7 @@ def find_landmarks(mesh: Mesh, settings: MeshSettings, layer_names: tuple[str, .
         lumen_top=mesh.node(0, top, middle),
         lumen_bottom=None if bottom is None else mesh.node(0, bottom, middle),
         lumen_ring=np.array([mesh.node(0, c % mesh.grid[1], middle) for c in ring]),
+        lumen_line=np.array([mesh.node(0, top, z) for z in range(mesh.grid[2])]),
         outer_top=mesh.node(-1, top, middle),
         P_layer=layer,
         P_cell=cell,
@@ -119,3 +122,24 @@ def lumen_area(x: Array, marks: Landmarks) -> Array:
     place, along = jnp.einsum("qa,eai->qei", N, edges), jnp.einsum("qa,eai->qei", dN[:, 0], edges)
     swept = 0.5 * (place[..., 0] * along[..., 1] - place[..., 1] * along[..., 0])
     return marks.symmetry.parts_of_a_section * jnp.sum(weights[:, None] * swept)
+
+
+def lumen_opening(x: Array, marks: Landmarks) -> Array:
+    """Greatest height of the lumen at mid-length over its width, mm: of what is left beside the fold, too.
+
+    Where the lower half is modelled, too, twice the greatest height above or below the axis.
+    """
+    return 2.0 * jnp.max(jnp.abs(x[marks.lumen_ring, 1]))
+
+
+def closed_length(x: Array, marks: Landmarks, height: Array) -> Array:
+    """Length along the artery over which the lumen is lower than `height` on the compression axis, mm.
+
+    Linear between the nodes; x: positions, (n_nodes, 3)
+    """
+    line = x[marks.lumen_line]
+    y, dz = line[:, 1] - 0.5 * height, jnp.diff(line[:, 2])
+    a, b = jnp.minimum(y[:-1], y[1:]), jnp.maximum(y[:-1], y[1:])
+    crossing = (a < 0.0) & (b > 0.0)
+    share = jnp.where(crossing, -a / jnp.where(crossing, b - a, 1.0), jnp.where(b <= 0.0, 1.0, 0.0))
+    return (2.0 if "z" in marks.symmetry else 1.0) * jnp.sum(share * dz)

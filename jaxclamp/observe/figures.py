@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from jaxclamp.fem.landmarks import lumen_area, lumen_height, lumen_width
+from jaxclamp.observe import closure
 from jaxclamp.observe.balance import balance
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measures import (
@@ -29,9 +30,12 @@ from jaxclamp.observe.measures import (
 )
 from jaxclamp.observe.stresses import gaps, noise
 from jaxclamp.potential.energy import gather
-from jaxclamp.potential.terms import INTIMA, JAWS
+from jaxclamp.potential.terms import JAWS
 
 Read = Callable[[Equilibria], Any]
+
+J_OFF = 0.05
+"""a wall keeps its volume; a point whose J is further from 1 is not resolved"""
 
 POINT, WHOLE = 1.0, 2.0
 """orders with which figures converge as the mesh is refined; stress at a point, such as P or where it
@@ -105,12 +109,6 @@ def _area(e: Equilibria) -> Array:
     return lumen_area(e.last.x, e.marks)
 
 
-def _overlap(e: Equilibria) -> Array:
-    """How far opposite inner walls are past the plane between them, both together, mm."""
-    heights = [group.here(INTIMA).side * e.last.x[group.nodes, 1] for group in e.potential.of(INTIMA)]
-    return 2.0 * jnp.max(jnp.stack([jnp.max(-height) for height in heights]))
-
-
 def _penetration(e: Equilibria) -> Array:
     deepest = [jnp.max(-gaps(group, e.last)) for group in e.potential.of(JAWS)]
     return jnp.maximum(jnp.max(jnp.stack(deepest)), 0.0)
@@ -121,6 +119,12 @@ def _penetration(e: Equilibria) -> Array:
 
 def _all_J(e: Equilibria) -> Array:
     return jnp.concatenate([e.stresses(i).J for i in range(len(e.marks.layer_names))], axis=1)
+
+
+def _share_off(e: Equilibria) -> Array:
+    """Share of the wall's stress-free volume whose J is off by more than `J_OFF`."""
+    dV = jnp.concatenate([group.solid.dV for group in e.potential.layers], axis=1)
+    return jnp.sum(jnp.where(jnp.abs(_all_J(e) - 1.0) > J_OFF, dV, 0.0)) / jnp.sum(dV)
 
 
 def _greatest(component: str) -> Read:
@@ -174,7 +178,15 @@ FIGURES = (
         lambda e: 1.0 - _area(e) / lumen_area(e.body.x, e.marks),
         shown=("summary", "numbers"),
     ),
-    Figure("lumen_overlap_mm", "overlap of opposite inner walls", _overlap, contract=False),
+    Figure("closed", "the lumen is closed at mid-length", closure.closed),
+    Figure("lumen_area_share", "lumen area, over that in the body", closure.area_share),
+    Figure("lumen_opening_mm", "greatest height left of the lumen", closure.opening, contract=False),
+    Figure("closed_length_mm", "length of artery that is closed", closure.length, contract=False),
+    Figure("lumen_overlap_mm", "overlap of opposite inner walls", closure.overlap, contract=False),
+    Figure("intima_contact_area_mm2", "contact area of opposite inner walls", closure.contact_area),
+    Figure(
+        "intima_force_share", "share of the jaw's force between inner walls", closure.carried, contract=False
+    ),
     Figure(
         "outer_radius_mm",
         "outer radius on the compression axis",
@@ -258,6 +270,14 @@ FIGURES = (
         shown=("summary",),
     ),
     Figure("J_min", "smallest volume ratio at a point", lambda e: jnp.min(_all_J(e)), stressed),
+    Figure("J_share_off", f"share of the wall whose J is off by more than {J_OFF:.0%}", _share_off, stressed),
+    Figure(
+        "fold_stretch_ratio",
+        "least stretch round the lumen, over that through the wall",
+        closure.fold_stretch_ratio,
+        stressed,
+        contract=False,
+    ),
     Figure("J_max", "largest volume ratio at a point", lambda e: jnp.max(_all_J(e)), stressed),
     Figure(
         "peak_axial_stress_kPa",

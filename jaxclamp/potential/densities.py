@@ -131,6 +131,8 @@ class Meeting:
     """its law"""
     dA: Array
     """stress-free area of a point of the lumen's surface, mm^2, (n_q, n_facets)"""
+    rule: FacetRule
+    """where the points of a facet are"""
     plane: Array
     """height of the plane, mm"""
     side: int = static(default=1)
@@ -140,8 +142,7 @@ class Meeting:
 def intima_energy(y: Tensor, q: Rigid, here: Meeting) -> Array:
     """Contact energy of the lumen's surface against its mirror image; y: position.
 
-    By symmetry the opposite walls meet in a plane (y = 0). The law of the jaws' contact, shifted so
-    that it sets in where the wall crosses the plane: beside the fold the open wall comes arbitrarily
-    close to it.
+    By symmetry the opposite walls meet in a plane (y = 0). Contact sets in where the wall crosses it: beside
+    the fold the open wall comes arbitrarily close.
     """
-    return here.contact.energy(here.side * (y[0, 1] - here.plane) + here.contact.smoothing) * here.dA
+    return here.contact.intima_energy(here.side * (y[0, 1] - here.plane)) * here.dA

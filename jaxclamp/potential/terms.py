@@ -309,7 +309,8 @@ def _intima(made: Made) -> Iterator[Term]:
     areas = facet_areas(made.body, made.stencils.meeting, outer=False)
     for name, facets in made.sides.items():
         dA = _some(areas, facets)
-        here = Meeting(contact=made.contact, dA=dA, plane=jnp.zeros(()), side=SIDES[name])
+        rule, plane = made.stencils.meeting, jnp.zeros(())
+        here = Meeting(contact=made.contact, dA=dA, rule=rule, plane=plane, side=SIDES[name])
         yield Term(name=INTIMA, region=f"{name} inside", stencil="meeting", density=intima_energy, here=here)
 
 

@@ -186,18 +186,14 @@ def _scene(table: dict[str, Any], fidelity: str) -> Scene:
     table = dict(table)
     if isinstance(table.get("clamp"), dict):
         table["clamp"] = _one_jaw(table["clamp"])
-    if isinstance(table.get("stop"), dict) and "closed" in table["stop"]:
-        raise refuse(
-            "stop.closed",
-            table["stop"]["closed"],
-            "another stop: complete closure is not available yet; use an occlusion, such as 0.925",
-        )
     mesh, contact = table.get("mesh", {}), table.get("contact", {})
-    if "artery" in table and isinstance(mesh, dict) and isinstance(contact, dict):
+    if "artery" in table:
         artery = schema.read(Artery, table["artery"], "artery")
         check_laws(artery)
-        table["mesh"] = schema.table(mesh_for(fidelity, artery)) | mesh
-        table["contact"] = schema.table(fitting_contact(artery)) | contact
+        if isinstance(mesh, dict):
+            table["mesh"] = schema.table(mesh_for(fidelity, artery)) | mesh
+        if isinstance(contact, dict):
+            table["contact"] = schema.table(fitting_contact(artery)) | contact
     scene = schema.read(Scene, table)
     check(scene)
     return scene

@@ -46,15 +46,16 @@ def apply_override(table: dict[str, Any], override: str, source: str) -> None:
 
 
 def _alternatives(section: Step) -> list[set[str]]:
-    """Sets of keys of which a table holds one: a key that is brought in pushes out the other sets."""
+    """Sets of keys that go together: a key that is brought in pushes out those that are in none with it."""
     if section == "stop":
-        return [{"closed"}, *(set(schema.fields_by_key(stop)) for stop in concrete_subclasses(Stop))]
+        return [set(schema.fields_by_key(stop)) for stop in concrete_subclasses(Stop)]
     return [{"jaw"}, {"upper", "lower"}] if section == "clamp" else []
 
 
 def _push_out(node: dict[str, Any], alternatives: list[set[str]], key: str) -> None:
-    if any(key in keys for keys in alternatives):
-        for other in (other for keys in alternatives if key not in keys for other in keys):
+    together = set().union(*(keys for keys in alternatives if key in keys))
+    if together:
+        for other in set().union(*alternatives) - together:
             node.pop(other, None)
 
 

@@ -88,6 +88,10 @@ class Stop(abc.ABC):
         (field,) = (f for f in dataclasses.fields(cast(Any, self)) if "range" in f.metadata)
         return field
 
+    def after(self) -> Stop | None:
+        """A stop to be reached before this one; None if there is none."""
+        return None
+
     def far_from_closure(self) -> bool:
         """True if opposite inner walls surely do not meet on the way to the stop."""
         return False

@@ -80,9 +80,19 @@ def is_chosen_by_key(base: Any) -> bool:
     return bool(vars(base).get("CHOSEN_BY_KEY", False)) and not dataclasses.is_dataclass(base)
 
 
-def owners(base: type) -> dict[str, type]:
-    """The records below a base that is chosen by key, by each key of theirs."""
-    return {key: cls for cls in concrete_subclasses(base) for key in fields_by_key(cls)}
+def keys_below(base: type) -> list[str]:
+    """The keys of the records below a base that is chosen by key."""
+    return list(dict.fromkeys(key for cls in concrete_subclasses(base) for key in fields_by_key(cls)))
+
+
+def choices_below(base: type) -> list[str]:
+    """What a table has to hold for each of the records below a base that is chosen by key."""
+    return [" with ".join(_required_keys(cls)) for cls in concrete_subclasses(base)]
+
+
+def _required_keys(cls: type) -> list[str]:
+    hints = get_type_hints(cls)
+    return [key for key, field in fields_by_key(cls).items() if is_required(field, hints[field.name])]
 
 
 def tag_of(cls: type) -> tuple[str, str]:
@@ -119,7 +129,7 @@ def read(kind: Any, table: Any, path: str = "") -> Any:
 
 def _main_keys(kind: Any) -> str:
     if is_chosen_by_key(kind):
-        return f"exactly one of {', '.join(owners(kind))}"
+        return f"exactly one of {', '.join(choices_below(kind))}"
     if inspect.isabstract(kind):
         return f"{tag_of(concrete_subclasses(kind)[0])[0]} = one of {_listed(_tags(kind))}"
     return ", ".join(fields_by_key(kind))
@@ -153,13 +163,16 @@ def _tagged(base: type, table: dict[str, Any], path: str) -> type:
 
 
 def _by_key(base: type, table: dict[str, Any], path: str) -> type:
-    """The one record below `base` whose key is in the table."""
-    owner = owners(base)
-    _refuse_unknown(table, list(owner), path)
-    chosen = {owner[key] for key in table}
+    """The one record below `base` that the keys of the table belong to."""
+    _refuse_unknown(table, keys_below(base), path)
+    chosen = [
+        cls
+        for cls in concrete_subclasses(base)
+        if set(_required_keys(cls)) <= set(table) <= set(fields_by_key(cls))
+    ]
     if len(chosen) != 1:
-        raise refuse(path, table, f"exactly one of {', '.join(owner)}")
-    return chosen.pop()
+        raise refuse(path, table, _main_keys(base))
+    return chosen[0]
 
 
 def _refuse_unknown(table: dict[str, Any], known: list[str], path: str, of: str = "") -> None:
@@ -242,6 +255,8 @@ def _number(value: Any) -> float | None:
 def _static_wanted(field: dataclasses.Field[Any], hint: Any) -> str:
     if field.metadata.get("choices"):
         return f"one of {_listed(field.metadata['choices'])}"
+    if hint is bool:
+        return "true"
     if hint is str:
         return f"a text on one line, at most {LONGEST_TEXT} characters"
     if get_origin(hint) is tuple:
@@ -256,7 +271,11 @@ def check_static(field: dataclasses.Field[Any], hint: Any, value: Any, path: str
         items = _items(value, path, expected)
         if all(_is_whole(item) for item in items):
             return tuple(items)
-    elif (hint is int and _is_whole(value)) or (hint is str and _is_text(value, field)):
+    elif (
+        (hint is int and _is_whole(value))
+        or (hint is str and _is_text(value, field))
+        or (hint is bool and value is True)
+    ):
         return value
     elif hint is float and _number(value) is not None:
         return _number(value)

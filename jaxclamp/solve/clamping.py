@@ -61,25 +61,32 @@ def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Res
     if to_stop:
         require_a_gap(scene)
     model = build_model(scene, None if guess is None else guess.model)
-    attempt, every_term = None, False
-    if guess is not None:
-        result, attempt = _from_neighbour(model, guess, tell, to_stop, start)
-        if result is not None:
-            return result
-        every_term = guess.every_term
-    elif to_stop and (coarser := to_walk_on(scene)) is not None:
-        result, attempt = _from_coarser_mesh(model, coarser, tell, start)
-        if result is not None:
-            return result
-    elif to_stop and (softer := with_softer_contact(scene)) is not None:
-        result = _from_softer_contact(model, softer, tell, start)
-        if result is not None:
-            return result
+    if guess is None and to_stop and (first := scene.stop.after()) is not None:
+        return _pressed_on(model, dataclasses.replace(scene, stop=first), tell, start)
+    result, attempt, every_term = _from_elsewhere(model, guess, tell, to_stop, start)
+    if result is not None:
+        return result
     attempt = Clamping(model, tell, every_term=every_term, before=attempt)
     try:
         return _from_nothing(attempt, to_stop, start)
     except TermMissing:
         return _from_nothing(Clamping(model, tell, every_term=True, before=attempt), to_stop, start)
+
+
+def _from_elsewhere(
+    model: Model, guess: Result | None, tell: Tell, to_stop: bool, start: float
+) -> tuple[Result | None, Clamping | None, bool]:
+    """The result from a neighbour's, a coarser mesh's or softer contact's; None where none leads there.
+
+    With it what was tried, and whether terms are needed that the stop seems not to need.
+    """
+    if guess is not None:
+        return *_from_neighbour(model, guess, tell, to_stop, start), guess.every_term
+    if to_stop and (coarser := to_walk_on(model.scene)) is not None:
+        return *_from_coarser_mesh(model, coarser, tell, start), False
+    if to_stop and (softer := with_softer_contact(model.scene)) is not None:
+        return _from_softer_contact(model, softer, tell, start), None, False
+    return None, None, False
 
 
 def _from_neighbour(
@@ -168,6 +175,35 @@ def _from_softer_contact(model: Model, softer: Scene, tell: Tell, start: float) 
     except (EquilibriumError, TermMissing):
         return None
     return _result(clamping, None, start, CLOSING_PATH, path)
+
+
+def _pressed_on(model: Model, before: Scene, tell: Tell, start: float) -> Result:
+    """The result from that of a stop which is to be reached first, with the jaws moved on from there."""
+    path = _solve(before, None, tell, to_stop=True)
+    last = path.states[-1].equilibrium
+    clamping = Clamping(model, tell, path.factors.take(np.asarray(last.lin.values)), path.every_term)
+    assert path.load_free is not None
+    assert path.physiological is not None
+    clamping.take_over(path.load_free, path.physiological)
+    clamping.states += [
+        dataclasses.replace(kept, model=model) if kept.model is path.model else kept
+        for kept in path.states[2:]
+    ]
+    clamping.use_terms(closing=True)
+    walked = str(path.solver["branch"])
+    failure = None
+    try:
+        clamping.require_to_come(last, before.stop)
+        clamping.go_on(last)
+    except EquilibriumError as error:
+        failure = error
+    pressed = [kept.equilibrium for kept in clamping.states[len(path.states) - 1 :]]
+    branch = walked if walked != CLOSING_PATH else branch_of(pressed)
+    result = dataclasses.replace(_result(clamping, failure, start, branch, path), coarser=path.coarser)
+    if failure is not None:
+        failure.result = result
+        raise failure
+    return result
 
 
 def _from_nothing(clamping: Clamping, to_stop: bool, start: float) -> Result:

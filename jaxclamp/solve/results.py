@@ -17,10 +17,12 @@ import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError
 from jaxclamp.core.parts import own_parts
+from jaxclamp.observe import closure
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import FIGURES
 from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.observe.measures import PEAK_SHARPNESS
+from jaxclamp.observe.stops import CLOSED
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
     from jaxclamp.pictures.plots import Picture
 
 
-FINAL_KEYS = tuple(figure.key for figure in FIGURES if figure.contract)
+FINAL_KEYS = (*(figure.key for figure in FIGURES if figure.contract), "closing_force_N")
 """always in a result's `final`, null where no state converged"""
 
 
@@ -184,12 +186,20 @@ class Result:
             {"stage": kept.stage}
             | seen
             | {
+                "closing_force_N": self._closing_force() if kept.values["closed"] else None,
                 "negative_pivots": e.negative_pivots,
                 "snapped": e.snapped,
                 "newton_iterations": e.iterations,
                 "mesh": kept.model.scene.mesh.words,
             }
         )
+
+    def _closing_force(self) -> float | None:
+        """Force on one jaw as the lumen is just closed, N; None if no state is at that very stop."""
+        at_closure = lambda kept: abs(kept.values["area_occlusion"] - CLOSED) < closure.ROUNDING  # noqa: E731
+        on_own_mesh = (kept for kept in self._stage("clamping") if kept.model is self.model)
+        first = next(filter(at_closure, on_own_mesh), None)
+        return None if first is None else first.values["clamp_force_N"]
 
     def history_table(self) -> dict[str, np.ndarray]:
         """The history by column, each (n_states,): made for `pandas.DataFrame` and the like.

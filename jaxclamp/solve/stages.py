@@ -37,7 +37,7 @@ from jaxclamp.solve.stops import Condition, Held, Row, Until
 FIRST_TOUCH = 0.02
 """the first closing step, as part of the outer radius: enough to bring points into contact"""
 NEARLY_CLOSED = 0.99
-"""a stop that does not change steadily is sought up to this occlusion"""
+"""a stop that does not change steadily is sought in steps of occlusion up to here, then of its measure"""
 SEEN_COMING = 0.7
 """share of the way to such a stop from which on closing goes in steps of its measure"""
 NEARLY_THERE = 0.95
@@ -194,6 +194,10 @@ class Clamping:
         self.use_terms(closing=True)
         equilibrium = self.first_contact(in_body)
         self.keep("clamping", equilibrium, 0.0, "first contact")
+        return self.go_on(equilibrium)
+
+    def go_on(self, equilibrium: Equilibrium) -> Equilibrium:
+        """Move the jaw on from a state under it until the stop."""
         for _ in range(MAX_RESCUES):
             path, reached = self.next_path(equilibrium)
             if path is None:
@@ -223,31 +227,26 @@ class Clamping:
         if self.distance(now) <= AT_THE_STOP * self.lumen_radius:
             return None, never
         if scene.solver.continuation == "travel" and share < NEARLY_THERE:
-            if not scene.stop.STEADY:
-                self.require_room(now)
             jaw, way = float(now.state.jaw_height), min(self.distance(now), self.lumen_radius)
             there = lambda e: self.share(e.state) > NEARLY_THERE  # noqa: E731
             return (lambda s: self.step(Held(jaw - s * way))), there
-        if scene.stop.STEADY or share > SEEN_COMING:
+        if scene.stop.STEADY or share > SEEN_COMING or self.occlusion(now.state) >= NEARLY_CLOSED - 1e-8:
             return self.towards(scene.stop, now, float(scene.stop.target())), never
-        self.require_room(now)
         coming = lambda e: self.share(e.state) > SEEN_COMING  # noqa: E731
         closed = OcclusionStop(kind="occlusion", occlusion=jnp.asarray(NEARLY_CLOSED))
         return self.towards(closed, now, NEARLY_CLOSED), coming
 
-    def require_room(self, now: Equilibrium) -> None:
-        """Raise EquilibriumError if the lumen is nearly closed already."""
-        occlusion = self.occlusion(now.state)
-        if occlusion >= NEARLY_CLOSED - 1e-8:
-            stop = self.model.scene.stop
-            value = self.in_file_unit(self.measure(now.state))
-            reason = f"{value} is all that {stop.kind} comes to at {NEARLY_CLOSED:.0%} occlusion"
+    def require_to_come(self, now: Equilibrium, before: Stop) -> None:
+        """Raise EquilibriumError if the stop that comes before is beyond the scene's own."""
+        if self.share(now.state) > 1.0:
+            value, target = map(self.in_file_unit, (self.measure(now.state), self.model.scene.stop.target()))
+            reason = f"'{before.kind}' takes {value} already, more than the stop of {target}"
             raise self.error("clamping", now, NotConverged(reason))
 
-    def in_file_unit(self, value: float) -> str:
+    def in_file_unit(self, value: Any) -> str:
         """A value of the stop's measure with its unit, for a reader."""
         unit = self.model.scene.stop.unit()
-        return f"{value / UNIT_FACTOR[unit]:.3g} {unit}".rstrip()
+        return f"{float(value) / UNIT_FACTOR[unit]:.3g} {unit}".rstrip()
 
     # --- the stop -------------------------------------------------------------------------------------
 
@@ -395,6 +394,8 @@ class Clamping:
         if stage == "clamping":
             height = float(last.state.jaw_height)
             load = f"occlusion {self.occlusion(last.state):.1%}, jaw height {height:.4f} mm"
+            if not (stop := self.model.scene.stop).STEADY:
+                load += f", {stop.kind} {self.in_file_unit(self.measure(last.state))}"
         else:
             load = f"pressure {last.pressure:.4g} kPa, axial stretch {last.axial_stretch:.4g}"
         return EquilibriumError(stage, f"beyond {load}", failure, ADVICE[stage])

@@ -1,0 +1,99 @@
+"""How far the lumen is closed: what is left of it, and where opposite inner walls press on each other."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxclamp.core.tensors import cross, norm, total
+from jaxclamp.fem.landmarks import closed_length, lumen_area, lumen_height, lumen_opening
+from jaxclamp.observe.balance import between_walls
+from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.measures import force_on_a_jaw
+from jaxclamp.observe.stops import CLOSED
+from jaxclamp.potential.densities import deformation
+from jaxclamp.potential.energy import State, at_points, gather, group_points
+from jaxclamp.potential.terms import INTIMA, Group
+
+NEAR_ENOUGH = 0.02
+"""opposite inner walls are closed where they are within this part of the lumen radius in the body"""
+CARRIED = 0.005
+"""least share of the jaw's force that inner walls carry beyond blood pressure where the lumen is closed; just
+closed, walls carried 0.9 to 7 % under cylinders and flat jaws, least on coarse meshes"""
+ROUNDING = 1e-6
+CREASE = 0.417
+"""ratio of the stretches along and across a free surface at which it creases: Hong, Zhao & Suo, Appl Phys
+Lett 95 (2009) 111901, of homogeneous neo-Hookean solids (1 / 2.4)"""
+
+
+def area_share(e: Equilibria) -> Array:
+    """Area of the lumen at mid-length over that in the body."""
+    return lumen_area(e.last.x, e.marks) / lumen_area(e.body.x, e.marks)
+
+
+def opening(e: Equilibria) -> Array:
+    """Greatest height of what is left of the lumen at mid-length, mm."""
+    return lumen_opening(e.last.x, e.marks)
+
+
+def length(e: Equilibria) -> Array:
+    """Length along the artery over which the inner walls are near enough to be closed, mm."""
+    return closed_length(e.last.x, e.marks, 0.5 * NEAR_ENOUGH * lumen_height(e.body.x, e.marks))
+
+
+def overlap(e: Equilibria) -> Array:
+    """How far opposite inner walls are past the plane between them, both together, mm."""
+    heights = [group.here(INTIMA).side * e.last.x[group.nodes, 1] for group in e.potential.of(INTIMA)]
+    return 2.0 * jnp.max(jnp.stack([jnp.max(-height) for height in heights]))
+
+
+def carried(e: Equilibria) -> Array:
+    """Share of the jaw's force that the inner walls press on each other with, beyond blood pressure."""
+    inner = e.marks.symmetry.parts_of_a_jaw * jnp.sum(between_walls(e.potential, e.last.x))
+    force = force_on_a_jaw(e)
+    pressed = force > 0.0
+    return jnp.where(pressed, inner / jnp.where(pressed, force, 1.0), 0.0)
+
+
+def closed(e: Equilibria) -> Array:
+    """True where no way for blood is left: by area, by opening, and by the force between the inner walls."""
+    shut = area_share(e) <= 1.0 - CLOSED + ROUNDING
+    near = opening(e) <= 0.5 * NEAR_ENOUGH * lumen_height(e.body.x, e.marks)
+    return shut & near & (carried(e) >= CARRIED)
+
+
+def contact_area(e: Equilibria) -> Array:
+    """Area over which the inner wall presses on the opposite one, mm^2, smoothly counted."""
+    parts = [jnp.sum(_pressing(group, e.last)) for group in e.potential.of(INTIMA)]
+    return e.marks.symmetry.parts_of_a_jaw * total(parts)
+
+
+def _pressing(group: Group, state: State) -> Array:
+    """Current area of the points of an inner wall in contact, mm^2, (n_q, n_facets).
+
+    In part where they press less than at the end of the law's smooth onset.
+    """
+    here, nodes = group.here(INTIMA), gather(state.x, group.nodes)
+    y = at_points(here.rule.dN, nodes)
+    first, second = ([y[c, i] for i in range(3)] for c in range(2))
+    da = norm(cross(first, second)) * jnp.asarray(here.rule.weights)[:, None]
+    height = here.side * (group_points(group, state.x)[0, 1] - here.plane)
+    pressure = -jax.grad(lambda gap: jnp.sum(here.contact.intima_energy(gap)))(height)
+    onset = here.contact.intima_stiffness * here.contact.intima_smoothing
+    share = jnp.clip(pressure / onset, 0.0, 1.0)
+    return da * share**2 * (3.0 - 2.0 * share)
+
+
+def fold_stretch_ratio(e: Equilibria) -> Array:
+    """Least ratio of the stretches round the lumen and through the wall in the innermost layer; see `CREASE`.
+
+    At the innermost points of the cells, along the deformed circumferential line and normal to the surface
+    with it.
+    """
+    group = e.potential.layers[0]
+    F = deformation(group_points(group, e.last.x), group.solid)
+    round_, along = ([F[i, k] for i in range(3)] for k in (1, 2))
+    J_over_normal = norm(cross(round_, along))  # area of the surface element; normal stretch = J / it
+    J = total(F[i, 0] * c for i, c in enumerate(cross(round_, along)))
+    return jnp.min(norm(round_) * J_over_normal / J)
