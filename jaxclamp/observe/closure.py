@@ -11,17 +11,22 @@ from jaxclamp.fem.landmarks import closed_length, lumen_area, lumen_height, lume
 from jaxclamp.observe.balance import between_walls
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measures import force_on_a_jaw
-from jaxclamp.observe.stops import CLOSED
 from jaxclamp.potential.densities import deformation
 from jaxclamp.potential.energy import State, at_points, gather, group_points
 from jaxclamp.potential.terms import INTIMA, Group
 
 NEAR_ENOUGH = 0.02
 """opposite inner walls are closed where they are within this part of the lumen radius in the body"""
+CLOSED = 0.995
+"""share of the lumen's area in the body that is gone where it counts as closed: blood does not pass through
+what is left beside the fold"""
 CARRIED = 0.005
-"""least share of the jaw's force that inner walls carry beyond blood pressure where the lumen is closed; just
-closed, walls carried 0.9 to 7 % under cylinders and flat jaws, least on coarse meshes"""
+"""least share of the jaw's force that inner walls carry, beyond blood pressure, where the lumen is closed"""
 ROUNDING = 1e-6
+"""of `closure` where it is 1"""
+INSIDE = 2.0 / 3.0
+"""away from the fold is within this part of the artery's width: what stays open beside the fold ends at 0.70 to
+0.75 of it"""
 CREASE = 0.417
 """ratio of the stretches along and across a free surface at which it creases: Hong, Zhao & Suo, Appl Phys
 Lett 95 (2009) 111901, of homogeneous neo-Hookean solids (1 / 2.4)"""
@@ -56,11 +61,19 @@ def carried(e: Equilibria) -> Array:
     return jnp.where(pressed, inner / jnp.where(pressed, force, 1.0), 0.0)
 
 
+def closure(e: Equilibria) -> Array:
+    """1 where the lumen is closed: the lesser of area gone over `CLOSED` and `carried` over `CARRIED`.
+
+    By area alone a thin wall may be as good as closed before it touches the opposite one; by force alone a
+    coarse fold pinches while the middle is open.
+    """
+    return jnp.minimum((1.0 - area_share(e)) / CLOSED, carried(e) / CARRIED)
+
+
 def closed(e: Equilibria) -> Array:
-    """True where no way for blood is left: by area, by opening, and by the force between the inner walls."""
-    shut = area_share(e) <= 1.0 - CLOSED + ROUNDING
+    """True where no way for blood is left: by `closure`, and by the greatest height left of the lumen."""
     near = opening(e) <= 0.5 * NEAR_ENOUGH * lumen_height(e.body.x, e.marks)
-    return shut & near & (carried(e) >= CARRIED)
+    return near & (closure(e) >= 1.0 - ROUNDING)
 
 
 def contact_area(e: Equilibria) -> Array:
@@ -80,7 +93,7 @@ def _pressing(group: Group, state: State) -> Array:
     da = norm(cross(first, second)) * jnp.asarray(here.rule.weights)[:, None]
     height = here.side * (group_points(group, state.x)[0, 1] - here.plane)
     pressure = -jax.grad(lambda gap: jnp.sum(here.contact.intima_energy(gap)))(height)
-    onset = here.contact.intima_stiffness * here.contact.intima_smoothing
+    onset = here.contact.intima_stiffness * here.contact.intima_onset
     share = jnp.clip(pressure / onset, 0.0, 1.0)
     return da * share**2 * (3.0 - 2.0 * share)
 
@@ -97,3 +110,24 @@ def fold_stretch_ratio(e: Equilibria) -> Array:
     J_over_normal = norm(cross(round_, along))  # area of the surface element; normal stretch = J / it
     J = total(F[i, 0] * c for i, c in enumerate(cross(round_, along)))
     return jnp.min(norm(round_) * J_over_normal / J)
+
+
+def volumes_away_from_fold(e: Equilibria) -> tuple[Array, Array]:
+    """Least and greatest J of points over the volume ratio of their cells, away from the fold.
+
+    Where cells bend more than their nodes can say, points are squeezed beside others that are blown up: at
+    the fold on every mesh that is not very fine; elsewhere it is the sign of a crumpled wall.
+    """
+    element = e.marks.element
+    N = jnp.asarray(element.shape(element.quadrature()[0])[0])
+    inside = INSIDE * jnp.max(jnp.abs(e.last.x[:, 0]))
+    least, most = [], []
+    for number, group in enumerate(e.potential.layers):
+        assert group.volume is not None
+        assert group.modes is not None
+        p = jnp.einsum("mq,mc->qc", jnp.asarray(group.modes), e.last.p[:, slice(*group.volume.cells)])
+        ratio = e.stresses(number).J / (1.0 + p / group.solid.material.bulk)
+        away = jnp.abs(jnp.einsum("qa,ac->qc", N, e.last.x[group.nodes, 0])) < inside
+        least.append(jnp.min(jnp.where(away, ratio, 1.0)))
+        most.append(jnp.max(jnp.where(away, ratio, 1.0)))
+    return jnp.min(jnp.stack(least)), jnp.max(jnp.stack(most))

@@ -179,6 +179,7 @@ FIGURES = (
         shown=("summary", "numbers"),
     ),
     Figure("closed", "the lumen is closed at mid-length", closure.closed),
+    Figure("closure", "closure by area, and by force between inner walls", closure.closure, contract=False),
     Figure("lumen_area_share", "lumen area, over that in the body", closure.area_share),
     Figure("lumen_opening_mm", "greatest height left of the lumen", closure.opening, contract=False),
     Figure("closed_length_mm", "length of artery that is closed", closure.length, contract=False),
@@ -271,6 +272,20 @@ FIGURES = (
     ),
     Figure("J_min", "smallest volume ratio at a point", lambda e: jnp.min(_all_J(e)), stressed),
     Figure("J_share_off", f"share of the wall whose J is off by more than {J_OFF:.0%}", _share_off, stressed),
+    Figure(
+        "J_min_away_from_fold",
+        "least J of a point over its cell's, away from the fold",
+        lambda e: closure.volumes_away_from_fold(e)[0],
+        stressed,
+        contract=False,
+    ),
+    Figure(
+        "J_max_away_from_fold",
+        "greatest J of a point over its cell's, away from the fold",
+        lambda e: closure.volumes_away_from_fold(e)[1],
+        stressed,
+        contract=False,
+    ),
     Figure(
         "fold_stretch_ratio",
         "least stretch round the lumen, over that through the wall",

@@ -12,16 +12,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxclamp.core.records import quantity, record, static
-from jaxclamp.fem.landmarks import lumen_area, lumen_height
+from jaxclamp.fem.landmarks import lumen_height
+from jaxclamp.observe import closure
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measures import force_on_a_jaw, travel_of_a_jaw
 from jaxclamp.scenes.scene import Stop
 
 FAR_FROM_CLOSURE = 0.5
 """opposite inner walls do not meet up to this occlusion"""
-CLOSED = 0.995
-"""share of the lumen's area in the body that is gone where it counts as closed: blood does not pass through
-what is left beside the fold"""
 
 
 @record
@@ -69,24 +67,34 @@ class ForceStop(Stop):
 
 
 @record
-class ClosedStop(Stop):
-    """Close until the inner walls meet all across: 1 - lumen area / that in the body, at mid-length.
-
-    Area changes steadily all the way, and does not depend on how finely the fold is resolved, as the force
-    between the walls does: coarse folds pinch early.
-    """
+class AreaStop(Stop):
+    """Close until a share of the lumen's area at mid-length is gone."""
 
     STEADY: ClassVar[bool] = True
+
+    kind: str = static("area occlusion")
+    area_occlusion: Array = quantity("", 1e-4, 0.9999)
+    """0: as in the body, 1: nothing is left"""
+
+    def measure(self, equilibria: Equilibria) -> Array:
+        return 1.0 - closure.area_share(equilibria)
+
+
+@record
+class ClosedStop(Stop):
+    """Close until no way for blood is left at mid-length: see `closure.closure`."""
 
     kind: str = static("closed")
     closed: bool = static()
     """true"""
-    area_occlusion: Array = quantity("", 0.9, 0.9999, default=CLOSED)
-    """the share of the area that is gone"""
+    closure: Array = quantity("", 0.9, 1.0, default=1.0)
+    """how far"""
 
     def measure(self, equilibria: Equilibria) -> Array:
-        e = equilibria
-        return 1.0 - lumen_area(e.last.x, e.marks) / lumen_area(e.body.x, e.marks)
+        return closure.closure(equilibria)
+
+    def after(self) -> Stop:
+        return AreaStop(kind="area occlusion", area_occlusion=closure.CLOSED * self.closure)
 
 
 @record
@@ -103,4 +111,4 @@ class PressedStop(Stop):
         return force_on_a_jaw(equilibria)
 
     def after(self) -> Stop:
-        return ClosedStop(closed=True, area_occlusion=jnp.asarray(CLOSED))
+        return ClosedStop(kind="closed", closed=True, closure=jnp.asarray(1.0))

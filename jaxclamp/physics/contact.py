@@ -17,10 +17,10 @@ class Contact:
     smoothing: Array = quantity("mm", 1e-9, 10.0)
     """the pressure sets in at this gap, and is exactly stiffness * penetration below minus it"""
 
-    intima_stiffness: Array = quantity("kPa_per_mm", 1e-3, 1e12)
-    """pressure between opposite inner walls per overlap of one of them with the plane between them"""
-    intima_smoothing: Array = quantity("mm", 1e-9, 10.0)
-    """that pressure sets in as the walls touch, and rises linearly from an overlap of twice this on"""
+    intima_stiffness_ratio: Array = quantity("", 1e-3, 1e6, default=250.0)
+    """stiffness between opposite inner walls over that at the jaws: what they overlap by is lumen lost"""
+    intima_smoothing_ratio: Array = quantity("", 1e-6, 1e3, default=0.05)
+    """smoothing there over that at the jaws"""
 
     def energy(self, gap: Array) -> Array:
         """Energy per stress-free outer area, kPa mm, with continuous second derivative.
@@ -34,4 +34,15 @@ class Contact:
 
         gap: distance of an inner wall from the plane where it meets the opposite one, mm, (*batch)
         """
-        return self.intima_stiffness * half_square(-(gap + self.intima_smoothing), self.intima_smoothing)
+        onset = self.intima_onset
+        return self.intima_stiffness * half_square(-(gap + onset), onset)
+
+    @property
+    def intima_stiffness(self) -> Array:
+        """Pressure between opposite inner walls per overlap of one with the plane between them, kPa/mm."""
+        return self.intima_stiffness_ratio * self.stiffness
+
+    @property
+    def intima_onset(self) -> Array:
+        """Their pressure sets in as they touch, and rises linearly from an overlap of twice this on, mm."""
+        return self.intima_smoothing_ratio * self.smoothing

@@ -12,25 +12,20 @@ PENETRATION = 0.01
 """share of the wall by which a jaw sinks in where it presses with the wall's own c + pressure"""
 SMOOTHING = 0.01
 """smoothing over the thickness of the wall"""
-INTIMA_STIFFER, INTIMA_SHARPER = 100.0, 20.0
-"""contact between inner walls is so many times as stiff, and smoothed over so many times less: what they
-overlap by is lumen lost, and has to stay below 0.5 % of the wall (docs/contact.md)"""
 
 
 def fitting_contact(artery: Artery) -> Contact:
-    """Contact of stiffness (c + p) / (1 % of H), smoothed over 1 % of H, and harder between inner walls.
+    """Contact of stiffness (c + p) / (1 % of H), smoothed over 1 % of H; see docs/contact.md.
 
     H is the thickness of the stress-free layers together, c the largest shear modulus of them, p the blood
     pressure: a wall presses back with its stiffness and with the blood behind it. They are numbers from then
-    on: gradients by c, p or a thickness do not see the rule. See docs/contact.md.
+    on: gradients by c, p or a thickness do not see the rule.
     """
     wall = sum(float(layer.thickness) for layer in artery.layers)
     c = max(float(np.max(np.asarray(layer.material.c))) for layer in artery.layers)
     stiffness = (c + float(artery.pressure)) / (PENETRATION * wall)
     ranges = {key: field.metadata["range"] for key, field in schema.fields_by_key(Contact).items()}
-    jaws = (stiffness, SMOOTHING * wall)
-    between_walls = (INTIMA_STIFFER * stiffness, SMOOTHING * wall / INTIMA_SHARPER)
-    values = zip(ranges.items(), (*jaws, *between_walls), strict=True)
+    values = zip(ranges.items(), (stiffness, SMOOTHING * wall), strict=False)  # the others have defaults
     table = {key: min(max(value, span.lower), span.upper) for (key, span), value in values}
     contact: Contact = schema.read(Contact, table, "contact")
     return contact

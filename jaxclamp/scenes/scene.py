@@ -14,7 +14,7 @@ from typing import Any, ClassVar, cast
 
 from jax import Array
 
-from jaxclamp.core.records import quantity, record, static
+from jaxclamp.core.records import UNIT_FACTOR, quantity, record, static
 from jaxclamp.physics.contact import Contact
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.physics.materials import Material
@@ -83,6 +83,11 @@ class Stop(abc.ABC):
     def unit(self) -> str:
         """The target's unit in scene files."""
         return str(self._quantity().metadata["range"].unit)
+
+    def said(self, value: Array | float) -> str:
+        """A value of the measure with its unit in scene files, for a reader."""
+        unit = self.unit()
+        return f"{float(value) / UNIT_FACTOR[unit]:.3g} {unit}".rstrip()
 
     def _quantity(self) -> dataclasses.Field[Any]:
         (field,) = (f for f in dataclasses.fields(cast(Any, self)) if "range" in f.metadata)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxclamp.core.failures import EquilibriumError, TermMissing
+from jaxclamp.core.failures import EquilibriumError, NotConverged, TermMissing
 from jaxclamp.core.progress import Progress, Tell, teller
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.scenes.files import require_computable
@@ -23,6 +23,9 @@ from jaxclamp.solve.nested import NEAR, to_walk_on
 from jaxclamp.solve.results import Kept, Result, work_balance
 from jaxclamp.solve.stages import Clamping
 from jaxclamp.solve.warm import branch_from, on_mesh_of, solve_warm
+
+BEYOND = 1e-6
+"""share of the way to a stop by which the stop before it may be beyond"""
 
 
 def clamp(
@@ -193,7 +196,12 @@ def _pressed_on(model: Model, before: Scene, tell: Tell, start: float) -> Result
     walked = str(path.solver["branch"])
     failure = None
     try:
-        clamping.require_to_come(last, before.stop)
+        if clamping.share(last.state) > 1.0 + BEYOND:
+            stop, there = model.scene.stop, clamping.measure(last.state)
+            reason = (
+                f"'{before.stop.kind}' takes {stop.said(there)} already, more than {stop.said(stop.target())}"
+            )
+            raise clamping.error("clamping", last, NotConverged(reason))
         clamping.go_on(last)
     except EquilibriumError as error:
         failure = error

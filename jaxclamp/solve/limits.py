@@ -8,11 +8,23 @@ ROUNDING = 1e-9
 """overlap of opposite inner walls, as part of the lumen radius, that is none: nodes on the fold lie at 0"""
 LARGEST_SINKING = 0.5
 """jaw and wall, or opposite inner walls, may overlap by this part of the wall's thickness"""
+CRUMPLED = (0.5, 1.5)
+"""volume of a point over that of its cell, away from the fold: beyond it cells are folded up in themselves"""
 
 
 def walls_meet(values: Record, lumen_radius: float) -> bool:
     """True if opposite inner walls overlap; lumen_radius: in the body, mm."""
     return bool(values["lumen_overlap_mm"] > ROUNDING * lumen_radius)
+
+
+def crumpled(values: Record) -> str | None:
+    """What tells that a converged state is one of crumpled cells, and what to do; None if nothing does."""
+    least, most = values["J_min_away_from_fold"], values["J_max_away_from_fold"]
+    if least < CRUMPLED[0] or most > CRUMPLED[1]:
+        return (
+            f"cells crumple (J is {least:.2g} to {most:.2g} of a cell's, away from the fold): refine the mesh"
+        )
+    return None
 
 
 def sinking(values: Record, thickness: float) -> str | None:

@@ -22,7 +22,6 @@ from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import FIGURES
 from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.observe.measures import PEAK_SHARPNESS
-from jaxclamp.observe.stops import CLOSED
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model
 from jaxclamp.potential.terms import needed
@@ -196,7 +195,7 @@ class Result:
 
     def _closing_force(self) -> float | None:
         """Force on one jaw as the lumen is just closed, N; None if no state is at that very stop."""
-        at_closure = lambda kept: abs(kept.values["area_occlusion"] - CLOSED) < closure.ROUNDING  # noqa: E731
+        at_closure = lambda kept: abs(kept.values["closure"] - 1.0) < closure.ROUNDING  # noqa: E731
         on_own_mesh = (kept for kept in self._stage("clamping") if kept.model is self.model)
         first = next(filter(at_closure, on_own_mesh), None)
         return None if first is None else first.values["clamp_force_N"]

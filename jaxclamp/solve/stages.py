@@ -13,7 +13,6 @@ import numpy as np
 
 from jaxclamp.core.failures import EquilibriumError, Exhausted, NotConverged, TermMissing
 from jaxclamp.core.progress import Progress, Tell
-from jaxclamp.core.records import UNIT_FACTOR
 from jaxclamp.fem.landmarks import half_height
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import Record, read_figures
@@ -28,7 +27,7 @@ from jaxclamp.solve.branch import KINK, gain, require_same_path
 from jaxclamp.solve.descent import descend_eased, ease_of
 from jaxclamp.solve.follow import follow, stretched
 from jaxclamp.solve.inflation import closed_tube, inflated_radius, inflated_tube
-from jaxclamp.solve.limits import sinking, walls_meet
+from jaxclamp.solve.limits import crumpled, sinking, walls_meet
 from jaxclamp.solve.linear_solvers import LinearSolver
 from jaxclamp.solve.newton import Equilibrium, Path, Step, System, bordered_step, newton
 from jaxclamp.solve.results import Kept
@@ -136,7 +135,7 @@ class Clamping:
         """Refuse a closing state that the model does not cover. Raises EquilibriumError, TermMissing."""
         if walls_meet(values, self.lumen_radius) and not self.system.potential.of(INTIMA):
             raise TermMissing(f"opposite inner walls meet before the stop: the term '{INTIMA}' is needed")
-        reason = sinking(values, self.outer_radius - self.lumen_radius)
+        reason = sinking(values, self.outer_radius - self.lumen_radius) or crumpled(values)
         if reason is not None:
             raise self.error("clamping", self.states[-1].equilibrium, NotConverged(reason))
 
@@ -230,23 +229,16 @@ class Clamping:
             jaw, way = float(now.state.jaw_height), min(self.distance(now), self.lumen_radius)
             there = lambda e: self.share(e.state) > NEARLY_THERE  # noqa: E731
             return (lambda s: self.step(Held(jaw - s * way))), there
-        if scene.stop.STEADY or share > SEEN_COMING or self.occlusion(now.state) >= NEARLY_CLOSED - 1e-8:
+        nearly_closed = self.occlusion(now.state) >= NEARLY_CLOSED - 1e-8
+        felt = lambda e: bool(np.any(self.row(e.state).by_x))  # noqa: E731
+        if nearly_closed and not felt(now):  # what is to press does not touch yet
+            jaw, way = float(now.state.jaw_height), 2.0 * half_height(now.state.x, self.model.marks)
+            return (lambda s: self.step(Held(jaw - s * way))), felt
+        if scene.stop.STEADY or share > SEEN_COMING or nearly_closed:
             return self.towards(scene.stop, now, float(scene.stop.target())), never
         coming = lambda e: self.share(e.state) > SEEN_COMING  # noqa: E731
         closed = OcclusionStop(kind="occlusion", occlusion=jnp.asarray(NEARLY_CLOSED))
         return self.towards(closed, now, NEARLY_CLOSED), coming
-
-    def require_to_come(self, now: Equilibrium, before: Stop) -> None:
-        """Raise EquilibriumError if the stop that comes before is beyond the scene's own."""
-        if self.share(now.state) > 1.0:
-            value, target = map(self.in_file_unit, (self.measure(now.state), self.model.scene.stop.target()))
-            reason = f"'{before.kind}' takes {value} already, more than the stop of {target}"
-            raise self.error("clamping", now, NotConverged(reason))
-
-    def in_file_unit(self, value: Any) -> str:
-        """A value of the stop's measure with its unit, for a reader."""
-        unit = self.model.scene.stop.unit()
-        return f"{float(value) / UNIT_FACTOR[unit]:.3g} {unit}".rstrip()
 
     # --- the stop -------------------------------------------------------------------------------------
 
@@ -395,7 +387,7 @@ class Clamping:
             height = float(last.state.jaw_height)
             load = f"occlusion {self.occlusion(last.state):.1%}, jaw height {height:.4f} mm"
             if not (stop := self.model.scene.stop).STEADY:
-                load += f", {stop.kind} {self.in_file_unit(self.measure(last.state))}"
+                load += f", {stop.kind} {stop.said(self.measure(last.state))}"
         else:
             load = f"pressure {last.pressure:.4g} kPa, axial stretch {last.axial_stretch:.4g}"
         return EquilibriumError(stage, f"beyond {load}", failure, ADVICE[stage])

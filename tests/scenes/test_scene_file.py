@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from jaxclamp.core.failures import SceneError
 from jaxclamp.core.records import concrete_subclasses, quantity, record, static
 from jaxclamp.fem.tube import build_tube, closed_radii
-from jaxclamp.observe.stops import CLOSED, ClosedStop, OcclusionStop, PressedStop, TravelStop
+from jaxclamp.observe.stops import ClosedStop, OcclusionStop, PressedStop, TravelStop
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.address import replace
 from jaxclamp.scenes.files import (
@@ -72,8 +72,8 @@ def scene_table(jaw, stop, first=HGO, second=HGO):
         "contact": {
             "stiffness_kPa_per_mm": 2000.0,
             "smoothing_mm": 0.01,
-            "intima_stiffness_kPa_per_mm": 1e5,
-            "intima_smoothing_mm": 1e-3,
+            "intima_stiffness_ratio": 200.0,
+            "intima_smoothing_ratio": 0.1,
         },
         "mesh": {
             "circumferential": 10,
@@ -252,7 +252,6 @@ def test_parts_can_be_named_in_scenes_and_overrides(kind):
         table = copy.deepcopy(tomllib.loads(dump_scene(load_scene("human-lad"))))
         (table if kind == "artery" else table["clamp"])[place.split(".")[-1]] = part.name
         table.pop("mesh")
-        table["contact"] = {key: table["contact"][key] for key in ("stiffness_kPa_per_mm", "smoothing_mm")}
         assert same(loads(table), by_override)
         assert same(loads_scene(dump_scene(by_override)), by_override)
 
@@ -393,14 +392,15 @@ def test_defaults_are_those_of_the_records():
 
 def test_a_stop_is_exactly_one():
     both = scene_table(FLAT, {"occlusion": 0.9, "force_N": 1.0})
-    assert "exactly one of occlusion, travel_mm, force_N, closed, closed with force_N" in refusal(both)
+    stops = "occlusion, travel_mm, force_N, area_occlusion, closed, closed with force_N"
+    assert f"exactly one of {stops}" in refusal(both)
     assert "stop.closed = false: expected true" in refusal(scene_table(FLAT, {"closed": False}))
     assert "stop.closed = 1: expected true" in refusal(scene_table(FLAT, {"closed": 1, "force_N": 1.0}))
 
 
 def test_closure_is_a_stop_alone_or_with_a_force_to_press_on_to():
     alone, pressed = (loads(scene_table(FLAT, {"closed": True} | more)) for more in ({}, {"force_N": 3.0}))
-    assert (type(alone.stop), float(alone.stop.target())) == (ClosedStop, CLOSED)
+    assert (type(alone.stop), float(alone.stop.target())) == (ClosedStop, 1.0)
     assert (type(pressed.stop), float(pressed.stop.target())) == (PressedStop, 3000.0)
     assert "[stop]\nclosed = true\nforce_N = 3.0\n" in dump_scene(pressed)
     assert loads_scene(dump_scene(alone)) == alone

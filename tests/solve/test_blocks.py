@@ -17,7 +17,6 @@ from tube import Sector
 from walks import mesh, tube_scene
 
 C, BULK = 10.0, 1e6
-INTIMA = {"intima_stiffness": 1e5, "intima_smoothing": 1e-3}
 RING = Sector(2.0, 0.74, 0.0, 27.0, k1=0.64, k2=3.54, fibre_angle=10.0)
 
 
@@ -107,7 +106,7 @@ def test_a_block_under_a_cylinder(spread):
         lambda X: np.repeat(np.isclose(X[:, 1], 0.0)[:, None], 3, axis=1),
         jaw=(
             Cylinder(radius=np.float64(1.0)),
-            Contact(stiffness=np.float64(2e3), smoothing=np.float64(0.01), **INTIMA),
+            Contact(stiffness=np.float64(2e3), smoothing=np.float64(0.01)),
         ),
     )
     found = settle(block, block.positions, jaw_height=0.8, steps=3)

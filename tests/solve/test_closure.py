@@ -9,8 +9,8 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.observe import closure
+from jaxclamp.observe.closure import CLOSED
 from jaxclamp.observe.points import deformation_gradient
-from jaxclamp.observe.stops import CLOSED
 from jaxclamp.solve.clamping import inflate
 
 COARSE = ["mesh.circumferential=7", "mesh.axial=10", "mesh.radial=[3,2]", "mesh.circumferential_grading=2"]
@@ -37,9 +37,9 @@ def test_nothing_is_left_of_the_lumen(closed):
     final = closed.final
     assert closed.solver["branch"] == "closing path"
     assert final["closed"] is True
-    assert final["lumen_area_share"] == pytest.approx(1.0 - CLOSED, abs=1e-9)
+    assert final["lumen_area_share"] <= 1.0 - CLOSED + 1e-9
     assert final["lumen_opening_mm"] <= 0.02 * closed.to_dict()["physiological"]["lumen_radius_mm"]
-    assert final["intima_force_share"] >= closure.CARRIED
+    assert final["intima_force_share"] >= (1.0 - 1e-9) * closure.CARRIED
     assert 0.0 <= final["lumen_overlap_mm"] <= 0.005 * WALL
     assert final["closing_force_N"] == final["clamp_force_N"]
     assert 0.0 < final["closed_length_mm"] < 6.0
@@ -77,9 +77,7 @@ def test_the_curve_of_force_rises_at_closure(pressed):
 
 
 def test_a_force_that_does_not_close_is_refused():
-    with pytest.raises(
-        jc.EquilibriumError, match=r"'closed' takes 0\.\d+ N already, more than the stop of 0.2 N"
-    ):
+    with pytest.raises(jc.EquilibriumError, match=r"'closed' takes 0\.\d+ N already, more than 0.2 N"):
         jc.clamp(human_lad("stop.closed=true", "stop.force_N=0.2"))
 
 
@@ -97,7 +95,7 @@ def test_inner_walls_that_meet_are_counted_by_hand(pressed):
     (group,) = e.potential.of("intima contact")
     here = group.here("intima contact")
     y = here.rule.position[:, 0] @ np.asarray(e.last.x)[np.asarray(group.nodes), 1]
-    s, k = float(here.contact.intima_smoothing), float(here.contact.intima_stiffness)
+    s, k = float(here.contact.intima_onset), float(here.contact.intima_stiffness)
     deep = np.maximum(-y - s, 0.0)  # beyond the onset the law is linear
     onset = np.clip(-y, 0.0, 2.0 * s)
     pressure = np.where(-y < 2.0 * s, k * onset**2 / (4.0 * s), k * deep)
@@ -108,12 +106,13 @@ def test_inner_walls_that_meet_are_counted_by_hand(pressed):
 
 
 def test_a_crease_is_measured_where_the_wall_is_round():
-    """In the body the ratio is lambda_theta / lambda_n of a tube: its least value is that of the media."""
+    """Normal stretch 1 / |F^-T e_r|, by inverting F."""
     result = inflate(human_lad("stop.closed=true"))
     e = result.equilibria
     F = np.asarray(deformation_gradient(e, "media"))
-    round_, through = np.linalg.norm(F[:, 1], axis=0), np.linalg.norm(F[:, 0], axis=0)
-    assert float(closure.fold_stretch_ratio(e)) == pytest.approx(np.min(round_ / through), rel=1e-3)
+    inverse = np.linalg.inv(np.moveaxis(F, (0, 1), (-2, -1)))
+    ratio = np.linalg.norm(F[:, 1], axis=0) * np.linalg.norm(inverse[..., 0, :], axis=-1)
+    assert float(closure.fold_stretch_ratio(e)) == pytest.approx(np.min(ratio), rel=1e-12)
 
 
 MEASURES = (jc.clamp_force(), jc.smooth_peak_axial_stress("media"), jc.jaw_travel())
