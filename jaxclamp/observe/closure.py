@@ -25,11 +25,7 @@ CARRIED = 0.005
 ROUNDING = 1e-6
 """of `closure` where it is 1"""
 INSIDE = 2.0 / 3.0
-"""away from the fold is within this part of the artery's width: what stays open beside the fold ends at 0.70 to
-0.75 of it"""
-CREASE = 0.417
-"""ratio of the stretches along and across a free surface at which it creases: Hong, Zhao & Suo, Appl Phys
-Lett 95 (2009) 111901, of homogeneous neo-Hookean solids (1 / 2.4)"""
+"""away from the fold is within this part of the artery's width: the gap beside the fold begins beyond"""
 
 
 def area_share(e: Equilibria) -> Array:
@@ -99,7 +95,7 @@ def _pressing(group: Group, state: State) -> Array:
 
 
 def fold_stretch_ratio(e: Equilibria) -> Array:
-    """Least ratio of the stretches round the lumen and through the wall in the innermost layer; see `CREASE`.
+    """Least ratio of the stretches round the lumen and through the wall inside, see `notes.CREASE`.
 
     At the innermost points of the cells, along the deformed circumferential line and normal to the surface
     with it.

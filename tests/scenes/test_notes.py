@@ -68,11 +68,16 @@ def test_the_ends_of_ranges_are_not_far():
 
 
 def test_volumes_that_change_are_noted():
-    body, last = {"J_min": 1.001, "J_max": 1.003}, {"J_min": 0.85, "J_max": 1.13}
+    rest = {"J_share_off": 0.02, "fold_stretch_ratio": 0.5}
+    body, last = {"J_min": 1.001, "J_max": 1.003}, {"J_min": 0.85, "J_max": 1.13, **rest}
     assert notes_of_states([]) == []
     assert notes_of_states([body, last]) == []
-    (said,) = notes_of_states([body, {"J_min": 0.7, "J_max": 1.26}])
-    assert said.startswith("J is 0.7 to 1.26 at single points of the last state")
+    (said,) = notes_of_states([body, {"J_min": 0.7, "J_max": 1.26, **rest}])
+    assert said.startswith(
+        "J is 0.7 to 1.26 at single points of the last state, off by more than 5 % in 0.02 of"
+    )
+    (said,) = notes_of_states([body, {**last, "fold_stretch_ratio": 0.4}])
+    assert "surface creases below 0.417" in said
     (said,) = notes_of_states([{"J_min": 0.99, "J_max": 1.06}, last])
     assert said.startswith("J is 0.99 to 1.06 in the body: the wall changes its volume")
 
