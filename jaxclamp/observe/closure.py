@@ -16,7 +16,7 @@ from jaxclamp.potential.energy import State, at_points, gather, group_points
 from jaxclamp.potential.terms import INTIMA, Group
 
 NEAR_ENOUGH = 0.02
-"""opposite inner walls are closed where they are within this part of the lumen radius in the body"""
+"""opposite inner walls count as met where they are within this part of the lumen radius in the body"""
 CLOSED = 0.995
 """share of the lumen's area in the body that is gone where it counts as closed: blood does not pass through
 what is left beside the fold"""
@@ -34,7 +34,7 @@ def area_share(e: Equilibria) -> Array:
 
 
 def opening(e: Equilibria) -> Array:
-    """Greatest height of what is left of the lumen at mid-length, mm."""
+    """Greatest height of what is left of the lumen at mid-length, mm: once closed, beside the fold."""
     return lumen_opening(e.last.x, e.marks)
 
 
@@ -67,9 +67,8 @@ def closure(e: Equilibria) -> Array:
 
 
 def closed(e: Equilibria) -> Array:
-    """True where no way for blood is left: by `closure`, and by the greatest height left of the lumen."""
-    near = opening(e) <= 0.5 * NEAR_ENOUGH * lumen_height(e.body.x, e.marks)
-    return near & (closure(e) >= 1.0 - ROUNDING)
+    """True where no way for blood is left."""
+    return closure(e) >= 1.0 - ROUNDING
 
 
 def contact_area(e: Equilibria) -> Array:

@@ -11,6 +11,7 @@ import jaxclamp as jc
 from jaxclamp.observe import closure
 from jaxclamp.observe.closure import CLOSED
 from jaxclamp.observe.points import deformation_gradient
+from jaxclamp.solve import limits
 from jaxclamp.solve.clamping import inflate
 
 COARSE = ["mesh.circumferential=7", "mesh.axial=10", "mesh.radial=[3,2]", "mesh.circumferential_grading=2"]
@@ -113,6 +114,17 @@ def test_a_crease_is_measured_where_the_wall_is_round():
     inverse = np.linalg.inv(np.moveaxis(F, (0, 1), (-2, -1)))
     ratio = np.linalg.norm(F[:, 1], axis=0) * np.linalg.norm(inverse[..., 0, :], axis=-1)
     assert float(closure.fold_stretch_ratio(e)) == pytest.approx(np.min(ratio), rel=1e-12)
+
+
+def test_crumpled_walls_are_refused(monkeypatch):
+    """With a limit that the wall of this mesh does not keep: what did converge stays."""
+    assert limits.crumpled({"J_min_away_from_fold": 0.45, "J_max_away_from_fold": 1.6}) is None
+    assert limits.crumpled({"J_min_away_from_fold": 0.9, "J_max_away_from_fold": 3.35}) is not None
+    monkeypatch.setattr(limits, "CRUMPLED", (0.95, 1.05))
+    with pytest.raises(jc.EquilibriumError, match=r"cells crumple \(J is .* refine the mesh") as caught:
+        jc.clamp(human_lad("stop.closed=true", "solver.path_mesh=own"))
+    assert caught.value.result.final["closed"] is False
+    assert 0.5 < caught.value.result.final["occlusion"] < 1.0
 
 
 MEASURES = (jc.clamp_force(), jc.smooth_peak_axial_stress("media"), jc.jaw_travel())
