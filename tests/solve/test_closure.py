@@ -124,7 +124,7 @@ def test_crumpled_walls_are_refused(monkeypatch):
     with pytest.raises(jc.EquilibriumError, match=r"cells crumple \(J is .* refine the mesh") as caught:
         jc.clamp(human_lad("stop.closed=true", "solver.path_mesh=own"))
     assert caught.value.result.final["closed"] is False
-    assert 0.5 < caught.value.result.final["occlusion"] < 1.0
+    assert 0.0 < caught.value.result.final["occlusion"] < 1.0
 
 
 MEASURES = (jc.clamp_force(), jc.smooth_peak_axial_stress("media"), jc.jaw_travel())
