@@ -1,6 +1,12 @@
 """Reference elements on [-1, 1]^3: nodes, quadrature, shape functions, pressure modes.
 
 Local axes are (radial, circumferential, axial). To add an element, add one entry to `ELEMENTS`.
+
+q1p0 keeps the mean volume of a cell alone. Where a wall is compressed along its surface, cells that are long
+along the artery then buckle into waves that alternate along it with no mean change of volume, long before a
+surface does: at a stretch ratio of 0.54 for cells four times as long as wide, against 0.296 (Biot 1963). q1pz
+resists these waves by a second pressure, linear along the artery, with a modulus of ten shear moduli: enough
+for cells ten times as long as wide, and too little to lock (docs/closure.md).
 """
 
 from __future__ import annotations
@@ -43,8 +49,10 @@ class Element:
     """name in scene files"""
     order: int
     """polynomial order of the displacement"""
-    pressure_order: int
-    """0: one pressure per cell (mean dilatation); 1: linear in the local coordinates"""
+    pressure_axes: tuple[int, ...]
+    """local axes along which a cell's pressure is linear; none: one pressure per cell (mean dilatation)"""
+    linear_modulus: float | None
+    """modulus of the linear pressures, in shear moduli of the material; None: its bulk modulus"""
     meshio_name: str
     """cell type in mesh files"""
     meshio_nodes: tuple[int, ...]
@@ -79,9 +87,8 @@ class Element:
         return lagrange(self.nodes_1d, points)
 
     def pressure_modes(self, points: np.ndarray) -> np.ndarray:
-        """Pressure modes at `points` (n, 3): 1 (and the local coordinates), (n_modes, n)."""
-        one = np.ones((1, len(points)))
-        return one if self.pressure_order == 0 else np.vstack([one, points.T])
+        """Pressure modes at `points` (n, 3): 1 and the coordinates along `pressure_axes`, (n_modes, n)."""
+        return np.vstack([np.ones((1, len(points))), points[:, list(self.pressure_axes)].T])
 
 
 def lagrange(nodes: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,7 +143,8 @@ def _vtk_order(order: int) -> tuple[int, ...]:
 ELEMENTS = {
     e.name: e
     for e in (
-        Element("q1p0", 1, 0, "hexahedron", _vtk_order(1)),
-        Element("q2p1", 2, 1, "hexahedron27", _vtk_order(2)),
+        Element("q1p0", 1, (), None, "hexahedron", _vtk_order(1)),
+        Element("q1pz", 1, (2,), 10.0, "hexahedron", _vtk_order(1)),
+        Element("q2p1", 2, (0, 1, 2), None, "hexahedron27", _vtk_order(2)),
     )
 }

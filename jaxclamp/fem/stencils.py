@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxclamp.core.records import record
+from jaxclamp.core.records import record, static
 from jaxclamp.fem.elements import Element, lagrange, lobatto, tensor_rule
 
 
@@ -45,6 +45,8 @@ class Stencils:
     """shape functions at the cells' points, (n_q, n_en)"""
     modes: np.ndarray
     """pressure modes, (n_m, n_q)"""
+    linear_modulus: float | None = static()
+    """of the modes beyond the first, in shear moduli; None: the bulk modulus"""
     lumen: FacetRule
     """of an inner facet, for blood pressure"""
     contact: FacetRule
@@ -75,6 +77,7 @@ def build_stencils(element: Element, contact_points: int) -> Stencils:
         weights=weights,
         positions=N,
         modes=element.pressure_modes(points),
+        linear_modulus=element.linear_modulus,
         lumen=facet_rule(element, tensor_rule((element.points_per_axis,) * 2)),
         contact=facet_rule(element, tensor_rule((contact_points,) * 2)),
         meeting=facet_rule(element, tensor_rule((meeting,) * 2, lobatto)),

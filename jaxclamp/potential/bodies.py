@@ -76,9 +76,20 @@ def solids(body: Body, stencils: Stencils) -> list[Solid]:
 
 
 def pressure_stiffness(solid: Solid, stencils: Stencils) -> Array:
-    """Inverse of M = int N_m N_n / bulk dV of each cell, kPa/mm^3, (n_m, n_m, n_cells)."""
-    M = jnp.einsum("mq,nq,qc->cmn", stencils.modes, stencils.modes, solid.dV / solid.material.bulk)
-    return jnp.moveaxis(jnp.linalg.inv(M), 0, -1)
+    """Inverse of M = int N_m N_n / bulk dV of each cell, kPa/mm^3, (n_m, n_m, n_cells).
+
+    Where linear pressures have a modulus of their own (`Element.linear_modulus`), k, it is
+    k (int N_m N_n dV)^-1 and what is missing to the bulk modulus in the mean pressure: a uniform change of
+    volume has a uniform pressure, whatever the cell's form.
+    """
+    products = lambda weights: jnp.einsum("mq,nq,qc->cmn", stencils.modes, stencils.modes, weights)  # noqa: E731
+    material, linear = solid.material, stencils.linear_modulus
+    if linear is None:
+        return jnp.moveaxis(jnp.linalg.inv(products(solid.dV / material.bulk)), 0, -1)
+    V = jnp.sum(solid.dV, axis=0)
+    k = linear * jnp.sum(material.c * solid.dV, axis=0) / V
+    mean = 1.0 / jnp.sum(solid.dV / material.bulk, axis=0)
+    return (k * jnp.moveaxis(jnp.linalg.inv(products(solid.dV)), 0, -1)).at[0, 0].add(mean - k / V)
 
 
 def facet_areas(body: Body, rule: FacetRule, outer: bool) -> Array:

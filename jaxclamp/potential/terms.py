@@ -5,7 +5,7 @@
                   + int phi(gap(x; q)) dA                                     jaw contact
                   + int phi(y + smoothing) dA                                 intima contact
 
-of the modelled part, with one or four pressures p per cell and M = int N_m N_n / bulk dV, so that at
+of the modelled part, with one, two or four pressures p per cell and M = int N_m N_n / bulk dV, so that at
 equilibrium p = bulk (J - 1) averaged over the cell (mean dilatation, Q1/P0) or projected on the linear
 functions (Q2/P1); q are the rigid coordinates (`densities.RIGID`).
 
@@ -248,16 +248,20 @@ class Kind:
     """the term's name, if it is only there while the jaws close"""
 
 
+KEPT = {
+    "q1p0": "volume change averaged over each cell",
+    "q1pz": "volume change averaged over each cell; its axial slope resisted by 10 shear moduli",
+    "q2p1": "pressure linear in each cell",
+}
+"""how the cells of each element keep their volume"""
+
+
 def _wall_reasons(scene: Scene) -> dict[str, str]:
     return {
         f"wall: {layer.name}": f"layer with law '{layer.material.law}', stress-free as an open sector "
         "(residual stress needs no further term)"
         for layer in scene.artery.layers
-    } | {
-        KEPT_VOLUME: "volume change averaged over each cell"
-        if scene.mesh.element == "q1p0"
-        else "pressure linear in each cell"
-    }
+    } | {KEPT_VOLUME: KEPT[scene.mesh.element]}
 
 
 def _wall(made: Made) -> Iterator[Term | Volume]:

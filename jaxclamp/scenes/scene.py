@@ -116,8 +116,9 @@ class MeshSettings:
     """elements grow by exp(grading) from the clamp to the end; 0 is uniform"""
     circumferential_grading: Array = quantity("", 0.0, 6.0, default=0.0)
     """elements grow by exp(grading) from the fold to the compression axis; 0 is uniform"""
-    element: str = static("q1p0", choices=("q1p0", "q2p1"))
-    """q1p0: 8 nodes, mean dilatation; q2p1: 27 nodes, linear discontinuous pressure"""
+    element: str = static("q1p0", choices=("q1p0", "q1pz", "q2p1"))
+    """q1p0: 8 nodes, mean dilatation; q1pz: the same, stable against axial waves at a sharp fold; q2p1: 27
+    nodes, linear discontinuous pressure"""
     contact_points: int = static(4)
     """contact quadrature points per facet and direction (more between inner walls where nodes need it)"""
     symmetry: str = static("auto", choices=("auto", "xyz", "xy", "xz", "yz", "x", "y", "z", "none"))

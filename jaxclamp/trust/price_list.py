@@ -100,7 +100,7 @@ def _meshes(scene: Scene) -> Iterator[Rung]:
         for factor in (0.5, 2.0):
             count = getattr(scaled(own, factor), direction)
             variants.append((direction, dataclasses.replace(own, **{direction: count})))
-    if own.element == "q1p0":
+    if own.element != "q2p1":
         quadratic = dataclasses.replace(own, element="q2p1")
         variants += [("element", scaled(quadratic, factor)) for factor in (0.5, 0.7)]
     for group, mesh in variants:

@@ -44,9 +44,9 @@ class Patch:
         return self.block.positions
 
 
-@pytest.fixture(params=["q1p0", "q2p1"])
+@pytest.fixture(params=["q1p0", "q1pz", "q2p1"])
 def patch(request):
-    n = 3 if request.param == "q1p0" else 2
+    n = 2 if request.param == "q2p1" else 3
     spacing = np.full(3, 1.0 / 3.0 if n == 3 else 0.25)
     rng = np.random.default_rng(1)
     places: list[np.ndarray] = []

@@ -85,7 +85,7 @@ class Setup:
         self.free = np.flatnonzero(~self.held.ravel())
         closed = np.asarray(closed_positions(self.mesh, self.scene.mesh, artery))
         rng = np.random.default_rng(3)
-        size = 0.04 if element == "q1p0" else 0.015
+        size = 0.015 if element == "q2p1" else 0.04
         moved = (
             closed * np.array([1.05, 0.98, 1.0]) + size * rng.uniform(-1.0, 1.0, closed.shape) * ~self.held
         )
@@ -108,7 +108,11 @@ class Setup:
         return jnp.asarray(field.reshape(self.x.shape))
 
 
-@pytest.fixture(scope="module", params=[("q1p0", 3), ("q2p1", 1)], ids=["q1p0 three laws", "q2p1 one law"])
+@pytest.fixture(
+    scope="module",
+    params=[("q1p0", 3), ("q1pz", 3), ("q2p1", 1)],
+    ids=["q1p0 three laws", "q1pz three laws", "q2p1 one law"],
+)
 def setup(request):
     return Setup(*request.param)
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 
 import jaxclamp as jc
 from jaxclamp.physics.contact import Contact
 from jaxclamp.physics.jaws import Cylinder
 from jaxclamp.physics.materials import NeoHookean
-from jaxclamp.solve.blocks import brick, reactions, settle, stress
+from jaxclamp.potential.densities import rigid
+from jaxclamp.potential.energy import energy
+from jaxclamp.solve.blocks import OPEN, brick, reactions, settle, stress
 from jaxclamp.solve.clamping import inflate
 from tube import Sector
 from walks import mesh, tube_scene
@@ -143,3 +148,50 @@ def test_a_ring_under_a_wide_flat_jaw():
         x[1:, ..., :2], np.broadcast_to(x[:1, ..., :2], x[1:, ..., :2].shape), atol=1e-8
     )
     np.testing.assert_allclose(x[-1, ..., 2], 1.1, rtol=1e-12)
+
+
+def negative_modes(element: str, elongation: float, ratio: float) -> int:
+    """Of a block compressed in plane strain to a stretch ratio (along its free surface over normal to it)."""
+    cells = np.array([6, 6, 2])
+    compressible = soft(bulk=np.float64(1e4 * C))
+    block = brick(
+        element,
+        (cells[0],),
+        cells[1],
+        cells[2],
+        lambda u: u * cells * [1.0, 1.0, elongation],
+        (compressible,),
+        lambda X: on(X, (0, 0.0), (1, 0.0), (1, 6.0), (2, 0.0), (2, 2.0 * elongation)),
+    )
+
+    def pull(normal: float) -> float:
+        """On the free surface, over c: from psi = c/2 (J**(-2/3) I1 - 3) + bulk/2 (J - 1)**2."""
+        along = ratio * normal
+        J, I1 = along * normal, along**2 + normal**2 + 1.0
+        return float(J ** (-2 / 3) * (normal - I1 / (3.0 * normal)) + 1e4 * (J - 1.0) * along)
+
+    normal = scipy.optimize.brentq(pull, 0.9 / np.sqrt(ratio), 1.1 / np.sqrt(ratio))
+    x = block.positions * [normal, ratio * normal, 1.0]
+    free = jnp.asarray(np.flatnonzero(~block.held))
+    q = rigid(OPEN)
+
+    def stored(u):
+        return energy(block.potential, jnp.asarray(x).ravel().at[free].add(u).reshape(x.shape), q)
+
+    u = jnp.zeros(len(free))
+    np.testing.assert_allclose(jax.grad(stored)(u), 0.0, atol=1e-7 * C)
+    return int(np.sum(np.linalg.eigvalsh(jax.hessian(stored)(u)) < -1e-9 * C))
+
+
+@pytest.mark.parametrize("elongation", [1.0, 4.0, 10.0])
+def test_a_compressed_surface_is_stable_up_to_its_limit(elongation):
+    """A free neo-Hookean surface in plane strain has waves below a stretch ratio of 0.2956 (Biot 1963)."""
+    assert negative_modes("q1pz", elongation, 0.2956) == 0
+    assert negative_modes("q1pz", elongation, 0.2) > 0
+
+
+def test_cells_with_a_mean_volume_alone_buckle_into_waves_along_the_artery():
+    """Why q1pz is there: long cells of q1p0 have waves of no mean dilatation far above the limit."""
+    assert negative_modes("q1p0", 1.0, 0.2956) == 0
+    assert negative_modes("q1p0", 4.0, 0.5) > 0
+    assert negative_modes("q1p0", 10.0, 0.6) > 0
