@@ -43,7 +43,7 @@ FidelityOption = Annotated[
     str | None,
     typer.Option(
         "--fidelity",
-        metavar="draft|standard|reference",
+        metavar="draft|standard|reference|seed",
         help="The mesh, where the scene has none of its own.",
         show_default="standard",
     ),

@@ -19,10 +19,9 @@ from tube import Sector
 def mesh(
     element: str, circumferential: int, axial: int, radial: tuple[int, ...], **others: Any
 ) -> MeshSettings:
-    """Mesh settings by position."""
-    return MeshSettings(
-        element=element, circumferential=circumferential, axial=axial, radial=radial, **others
-    )
+    """Mesh settings by position; evenly spaced round the artery unless said."""
+    counts = {"element": element, "circumferential": circumferential, "axial": axial, "radial": radial}
+    return MeshSettings(**{"circumferential_grading": 0.0} | counts | others)
 
 
 def material(sector: Sector, bulk: float) -> Material:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from jaxclamp.scenes import schema
-from jaxclamp.scenes.scene import Artery, MeshSettings
+from typing import Any
+
+from jaxclamp.scenes.scene import Artery
 
 COUNTS = ("circumferential", "axial", "radial")
 """the keys of a mesh that a fidelity decides"""
 
-FIDELITIES = {"draft": (7, 10, 5), "standard": (10, 15, 8), "reference": (20, 30, 16)}
+FIDELITIES = {
+    "draft": (10, 10, 5),
+    "standard": (14, 15, 8),
+    "reference": (20, 30, 16),
+    "seed": (10, 15, 8),
+}
 """elements over the quarter circumference, over the half length, through the wall"""
+
+SEED = {"element": "q1p0", "circumferential_grading": 0.0}
+"""what else the mesh of the study of 2002 has: uniform round the artery, one pressure per cell"""
 
 ERRORS_ON_HUMAN_LAD = {
     "draft": {
@@ -35,15 +44,30 @@ ERRORS_ON_HUMAN_LAD = {
 other scenes the stress at P has been off by up to 36 %: what counts is the estimate of a result's errors"""
 
 
-def mesh_for(fidelity: str, artery: Artery) -> MeshSettings:
-    """The mesh of a fidelity: the radial elements are shared out by the layers' thickness."""
+def mesh_for(fidelity: str, artery: Artery, own: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The mesh of a fidelity as a table, with the keys that a scene has of its own.
+
+    The radial elements are shared out by the layers' thickness.
+    """
     circumferential, axial, radial = FIDELITIES[fidelity]
     if fidelity == "reference":
-        counts = tuple(2 * count for count in mesh_for("standard", artery).radial)
+        counts = [2 * count for count in mesh_for("standard", artery)["radial"]]
     else:
-        counts = _shares(radial, [float(layer.thickness) for layer in artery.layers])
-    values = dict(zip(COUNTS, (circumferential, axial, list(counts)), strict=True))
-    return schema.read(MeshSettings, values, "mesh")
+        counts = list(_shares(radial, [float(layer.thickness) for layer in artery.layers]))
+    mesh = dict(zip(COUNTS, (circumferential, axial, counts), strict=True)) | (own or {})
+    return (
+        {"circumferential_grading": grading(mesh["circumferential"])}
+        | (SEED if fidelity == "seed" else {})
+        | mesh
+    )
+
+
+def grading(circumferential: Any) -> float:
+    """How much a mesh is drawn together towards the fold, by its elements over the quarter circumference.
+
+    With fewer than ten an element would cover more than 19 degrees on the other side.
+    """
+    return 2.0 if isinstance(circumferential, int) and circumferential >= 10 else 0.0
 
 
 def _shares(total: int, sizes: list[float]) -> tuple[int, ...]:

@@ -191,7 +191,7 @@ def _scene(table: dict[str, Any], fidelity: str) -> Scene:
         artery = schema.read(Artery, table["artery"], "artery")
         check_laws(artery)
         if isinstance(mesh, dict):
-            table["mesh"] = schema.table(mesh_for(fidelity, artery)) | mesh
+            table["mesh"] = mesh_for(fidelity, artery, mesh)
         if isinstance(contact, dict):
             table["contact"] = schema.table(fitting_contact(artery)) | contact
     scene = schema.read(Scene, table)

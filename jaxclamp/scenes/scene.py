@@ -115,8 +115,9 @@ class MeshSettings:
     axial_grading: Array = quantity("", 0.0, 12.0, default=2.5)
     """elements grow by exp(grading) from the clamp to the end; 0 is uniform"""
     circumferential_grading: Array = quantity("", 0.0, 6.0, default=0.0)
-    """elements grow by exp(grading) from the fold to the compression axis; 0 is uniform"""
-    element: str = static("q1p0", choices=("q1p0", "q1pz", "q2p1"))
+    """elements grow by exp(grading) from the fold to the compression axis; 0 is uniform. In a file that does
+    not say: `fidelity.grading`"""
+    element: str = static("q1pz", choices=("q1pz", "q1p0", "q2p1"))
     """q1p0: 8 nodes, mean dilatation; q1pz: the same, stable against axial waves at a sharp fold; q2p1: 27
     nodes, linear discontinuous pressure"""
     contact_points: int = static(4)

@@ -132,7 +132,7 @@ def test_inner_walls_that_meet_unexpectedly_bring_their_term_back(monkeypatch):
 
 @pytest.mark.parametrize("pressure", [0.0, 13.33])
 def test_show_lists_the_terms_there_are(pressure):
-    described = describe(jc.load_scene("human-lad", [f"artery.pressure_kPa={pressure}"]))
+    described = describe(jc.load_scene("human-lad", [f"artery.pressure_kPa={pressure}"], "seed"))
     assert described["unknowns"] == 4266
     assert (BLOOD in described["terms"]) == (pressure > 0.0)
     assert set(described["terms"]) >= {"wall: media", "wall: adventitia", KEPT_VOLUME, JAWS}

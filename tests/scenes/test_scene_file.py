@@ -220,8 +220,9 @@ def test_human_lad_is_the_study_of_2002():
     assert media.material.fibre_energy == "eq4"
     assert (scene.clamp.jaw.radius, scene.stop.occlusion) == (3.0, 0.925)
     assert (scene.contact.stiffness, scene.contact.smoothing) == (2000.0, 0.01)
-    mesh = scene.mesh
+    mesh = load_scene("human-lad", fidelity="seed").mesh
     assert (mesh.circumferential, mesh.axial, mesh.radial, mesh.axial_grading) == (10, 15, (5, 3), 2.5)
+    assert (mesh.element, mesh.circumferential_grading) == ("q1p0", 0.0)
     assert [layer.name for layer in scene.artery.layers] == ["media", "adventitia"]
 
 
@@ -380,9 +381,9 @@ def test_defaults_are_those_of_the_records():
     table = {key: TABLES["flat, goh, travel"][key] for key in ("artery", "clamp", "stop")}
     scene = loads(table)
     assert (scene.mesh.element, scene.mesh.contact_points, scene.mesh.circumferential_grading) == (
-        "q1p0",
+        "q1pz",
         4,
-        0.0,
+        2.0,
     )
     assert (scene.solver.continuation, scene.solver.linear_solver, scene.title) == ("lumen", "auto", "")
 
@@ -520,12 +521,21 @@ def test_numbers_become_floats_in_internal_units():
 
 @pytest.mark.parametrize(
     ("fidelity", "counts"),
-    [("draft", (7, 10, (3, 2))), ("standard", (10, 15, (5, 3))), ("reference", (20, 30, (10, 6)))],
+    [
+        ("draft", (10, 10, (3, 2))),
+        ("standard", (14, 15, (5, 3))),
+        ("reference", (20, 30, (10, 6))),
+        ("seed", (10, 15, (5, 3))),
+    ],
 )
 def test_fidelity_chooses_the_mesh_where_the_scene_does_not(fidelity, counts):
     mesh = load_scene("human-lad", fidelity=fidelity).mesh
     assert (mesh.circumferential, mesh.axial, mesh.radial) == counts
     assert mesh.axial_grading == 2.5
+    uniform = fidelity == "seed"
+    assert (mesh.element, mesh.circumferential_grading) == (("q1p0", 0.0) if uniform else ("q1pz", 2.0))
+    few = load_scene("human-lad", ["mesh.circumferential=9"], fidelity).mesh
+    assert few.circumferential_grading == 0.0  # an element on the other side would cover 20 degrees
     mixed = load_scene("human-lad", ["mesh.axial=33"], fidelity).mesh
     assert (mixed.circumferential, mixed.axial, mixed.radial) == (counts[0], 33, counts[2])
 
@@ -536,7 +546,7 @@ def test_every_layer_gets_an_element():
 
 
 def test_unknown_fidelity_is_refused():
-    with pytest.raises(SceneError, match="expected one of draft, standard, reference"):
+    with pytest.raises(SceneError, match="expected one of draft, standard, reference, seed"):
         load_scene("human-lad", fidelity="fine")
 
 

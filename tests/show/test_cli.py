@@ -16,10 +16,12 @@ import pytest
 
 from jaxclamp.cli import main
 from jaxclamp.core.failures import EquilibriumError, NoReference, NotConverged, SceneError
+from jaxclamp.scenes import schema
 from jaxclamp.scenes.fidelity import mesh_for
 from jaxclamp.scenes.files import load_scene
 from jaxclamp.scenes.notes import notes
 from jaxclamp.scenes.presets import presets
+from jaxclamp.scenes.scene import MeshSettings
 from jaxclamp.show import console
 from jaxclamp.show import export as real_export
 
@@ -200,7 +202,7 @@ def test_run_passes_overrides_and_fidelity_on(engine, capsys):
     assert code == 0
     (scene,) = engine.scenes
     assert (scene.clamp.jaw.radius, scene.stop.travel) == (1.5, 2.0)
-    assert scene.mesh == mesh_for("draft", scene.artery)
+    assert scene.mesh == schema.read(MeshSettings, mesh_for("draft", scene.artery), "mesh")
     assert "note: --fidelity draft: on human-lad, errors of 4.0% in the" in err
     assert "those of this scene are estimated at the end" in err
     assert "% in the jaw force" in err
@@ -380,7 +382,7 @@ WRONG = {
     "unknown key": (["run", "human-lad", "--set", "clamp.jaw.radios_mm=1"], "did you mean radius_mm?"),
     "no override": (["run", "human-lad", "--set", "clamp"], "KEY=VALUE"),
     "cannot close": (["run", "human-lad", "--set", "artery.layers[0].opening_angle_deg=340"], "close"),
-    "unknown fidelity": (["run", "human-lad", "--fidelity", "fine"], "draft, standard, reference"),
+    "unknown fidelity": (["run", "human-lad", "--fidelity", "fine"], "draft, standard, reference, seed"),
     "file for a folder": (["run", "human-lad", "--out", "file"], "'file'"),
     "file in the path": (["run", "human-lad", "--out", "file/a/b"], "'file/a/b'"),
     "long path": (["run", "human-lad", "--out", "a" * 300], "--out"),

@@ -11,7 +11,7 @@ SMALL = ["mesh.circumferential=3", "mesh.axial=3", "mesh.radial=[1, 1]"]
 
 @pytest.mark.parametrize("pressure", [0.0, 13.33])
 def test_the_terms_there_are_are_listed(pressure):
-    described = describe(jc.load_scene("human-lad", [f"artery.pressure_kPa={pressure}"]))
+    described = describe(jc.load_scene("human-lad", [f"artery.pressure_kPa={pressure}"], "seed"))
     assert described["unknowns"] == 4266
     assert ("blood pressure" in described["terms"]) == (pressure > 0.0)
     assert set(described["terms"]) >= {"wall: media", "wall: adventitia", "incompressibility", "jaw contact"}

@@ -284,7 +284,7 @@ def test_quadratic_elements():
 
 
 def test_the_study_of_2002():
-    result = jc.clamp(jc.load_scene("human-lad"))
+    result = jc.clamp(jc.load_scene("human-lad", fidelity="seed"))
     assert_sound(result)
     final, content = result.final, result.to_dict()
     assert content["model"]["elements"] == 1200
@@ -302,7 +302,7 @@ def test_the_study_of_2002():
 
 @pytest.mark.slow
 def test_the_study_of_2002_with_printed_equation_10():
-    result = jc.clamp(jc.load_scene("human-lad-eq10"))
+    result = jc.clamp(jc.load_scene("human-lad-eq10", fidelity="seed"))
     assert_sound(result)
     content, final = result.to_dict(), result.final
     assert content["physiological"]["lumen_radius_mm"] == pytest.approx(2.524, abs=1e-3)

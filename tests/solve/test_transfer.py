@@ -22,7 +22,8 @@ def on_mesh(scene, **counts):
 
 @pytest.fixture(scope="module")
 def coarse():
-    scene = on_mesh(jc.load_scene("human-lad"), circumferential=6, axial=9, radial=(2, 2))
+    counts = {"circumferential": 6, "axial": 9, "radial": (2, 2)}
+    scene = on_mesh(jc.load_scene("human-lad", fidelity="seed"), **counts)
     return jc.clamp(scene)
 
 
