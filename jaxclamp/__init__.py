@@ -49,7 +49,7 @@ from jaxclamp.observe.points import (  # noqa: E402
     stresses,
     volumes,
 )
-from jaxclamp.observe.stops import ForceStop, OcclusionStop, TravelStop  # noqa: E402
+from jaxclamp.observe.stops import ClosedStop, ForceStop, OcclusionStop, PressedStop, TravelStop  # noqa: E402
 from jaxclamp.physics.jaws import Jaw  # noqa: E402
 from jaxclamp.physics.materials import FibreLaw, Material  # noqa: E402
 from jaxclamp.scenes.address import replace  # noqa: E402
@@ -67,6 +67,7 @@ from jaxclamp.trust.estimates import Estimate, Neighbours, neighbours, with_erro
 
 __all__ = [
     "MEASURES",
+    "ClosedStop",
     "Equilibria",
     "EquilibriumError",
     "Estimate",
@@ -79,6 +80,7 @@ __all__ = [
     "N",
     "Neighbours",
     "OcclusionStop",
+    "PressedStop",
     "Progress",
     "Result",
     "Scene",

@@ -1,4 +1,4 @@
-"""The command line: `jaxclamp show`, `run`, `optimise`, `accuracy` and `presets`.
+"""The command line: `jaxclamp show`, `run`, `optimise`, `compare`, `accuracy` and `presets`.
 
 Exit codes: 0 done; 2 the input is wrong; 3 no converged solution; 4 the machine refused; 130
 interrupted; 143 terminated. What went wrong is one sentence on standard error. Results go to standard output,
@@ -7,10 +7,8 @@ progress and notes to standard error. Only what a command needs is imported, whe
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
-import tempfile
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
 from pathlib import Path
@@ -22,12 +20,12 @@ from jaxclamp.core.failures import Failure
 from jaxclamp.core.signals import INTERRUPTED, TERMINATED, Terminated, ending
 from jaxclamp.scenes.presets import KINDS, preset
 from jaxclamp.scenes.presets import presets as shipped
-from jaxclamp.show import console
+from jaxclamp.show import console, folders
 
 if TYPE_CHECKING:
     from jaxclamp.scenes.scene import Scene
 
-DONE, WRONG_INPUT, MACHINE_REFUSED = 0, 2, 4
+DONE, WRONG_INPUT, NOT_CONVERGED, MACHINE_REFUSED = 0, 2, 3, 4
 """exit codes; failures bring their own"""
 
 app = typer.Typer(
@@ -183,7 +181,7 @@ def run(
     loaded = _load(scene, fidelity, overrides, quiet)
     folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-result")
     if folder is not None:
-        _check_results(folder, scene)
+        folders.check_results(folder, scene)
     from jaxclamp.scenes.notes import notes
 
     unlikely = notes(loaded)
@@ -223,7 +221,7 @@ def optimise(
     _import(parts)
     asked = load_study(study)
     folder = out or Path(f"{Path(study).stem}-study")
-    _check_folder(folder)
+    folders.check(folder)
     with console.progress(quiet) as progress:
         tell = progress if callable(progress) else None
         found = asked.run(folder, resume, tell)
@@ -234,6 +232,56 @@ def optimise(
         typer.echo("\n".join([asked.title, *found.lines(), "", *(f"  open {path}" for path in files)]))
     if (said := warning(found)) is not None:
         typer.echo(f"jaxclamp: warning: {said}", err=True)
+    return DONE
+
+
+@app.command()
+def compare(
+    scene: SceneArgument,
+    clamps: Annotated[
+        str,
+        typer.Option("--clamps", metavar="A,B,…", help="Jaws: names of presets, or TOML files of one jaw."),
+    ],
+    rank: Annotated[
+        str | None,
+        typer.Option(
+            "--rank",
+            metavar="MEASURE",
+            help="What ranks them, e.g. clamp_force_N or smooth_peak_axial_stress_kPa.adventitia.",
+            show_default="smooth_peak_axial_stress_kPa of the media",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="./SCENE-compared"),
+    ] = None,
+    fidelity: FidelityOption = None,
+    overrides: SetOption = None,
+    parts: ImportOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Put one artery into several clamps: at the scene's stop, just closed, and at equal force."""
+    from optimize.comparison import asked_clamps, lines, ranking
+    from optimize.comparison import compare as compare_clamps
+    from optimize.comparison_report import write_comparison
+
+    _import(parts)
+    asked = asked_clamps(scene, clamps, overrides or (), fidelity or "standard")
+    rank_by, measure = ranking(rank, tuple(layer.name for layer in asked[0].scene.artery.layers))
+    folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-compared")
+    if folder is not None:
+        folders.check(folder)
+    with console.progress(quiet) as progress:
+        tell = progress if callable(progress) else None
+        found = compare_clamps(asked, rank_by, measure, progress=tell)
+        files = [] if folder is None else write_comparison(found, folder, tell)
+    if as_json:
+        typer.echo(console.as_json(found.to_dict()))
+    elif not quiet:
+        typer.echo("\n".join([found.title, *lines(found), "", *(f"  open {path}" for path in files)]))
+    if all(each.at_stop is None for each in found.clamps):
+        return _fail("no clamp has an equilibrium at the scene's stop: see the reasons above", NOT_CONVERGED)
     return DONE
 
 
@@ -254,7 +302,7 @@ def accuracy(
     _import(parts)
     loaded = _load(scene, fidelity, overrides, quiet)
     folder = out or Path(f"{Path(scene).stem}-accuracy")
-    _check_folder(folder)
+    folders.check(folder)
     from jaxclamp.show.price_report import lines, write_prices
     from jaxclamp.trust.price_list import price_list
 
@@ -320,41 +368,6 @@ def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: 
         said = f"on human-lad, errors of {errors}; those of this scene are estimated at the end"
         typer.echo(f"note: --fidelity {fidelity}: {said}", err=True)
     return loaded
-
-
-def _check_results(folder: Path, scene: str) -> None:
-    """Refuse a folder for the results of a scene where they would replace that scene, or files of others."""
-    from jaxclamp.show.folder import SCENE, require_ours
-
-    _check_folder(folder)
-    try:
-        if (folder / SCENE).exists() and Path(scene).exists() and (folder / SCENE).samefile(scene):
-            raise FileExistsError(errno.EEXIST, f"{scene}, the scene itself, would be replaced")
-        require_ours(folder)
-    except OSError as error:
-        raise typer.BadParameter(
-            f"{error.strerror} in {str(folder)!r}: take another folder", param_hint="--out"
-        ) from None
-
-
-def _check_folder(folder: Path) -> None:
-    """Refuse a folder in which no file can be written; leaves nothing behind."""
-    missing: list[Path] = []
-    try:
-        missing += [path for path in (folder, *folder.parents) if not path.exists()]
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        finally:
-            for path in missing:
-                with suppress(OSError):
-                    path.rmdir()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise typer.BadParameter(
-            f"no files can be written in {str(folder)!r}: {reason}", param_hint="--out"
-        ) from None
 
 
 def _solve(scene: Scene, quiet: bool) -> tuple[Any, Failure | None]:

@@ -24,6 +24,12 @@ class SceneError(Failure):
     exit_code = 2
 
 
+class BadFolder(Failure):
+    """A folder that results were to be written into, and cannot or should not be."""
+
+    exit_code = 2
+
+
 class BadKey(Failure):
     """One sentence on what is wrong with one key; the reader of the file adds its name (`SceneError`)."""
 

@@ -164,7 +164,7 @@ def _parsed(text: str, source: str) -> dict[str, Any]:
 
 
 def _expand(table: dict[str, Any], source: str) -> None:
-    """Put presets in place of their names (of an artery, of a jaw)."""
+    """Put presets and files in place of their names (of an artery, of a jaw)."""
     clamp = table.get("clamp")
     places = [(table, "artery", "artery")]
     if isinstance(clamp, dict):
@@ -174,7 +174,7 @@ def _expand(table: dict[str, Any], source: str) -> None:
         if isinstance(name, str):
             where = key if kind == "artery" else f"clamp.{key}"
             try:
-                owner[key] = parsed(preset(name, kind).text)
+                owner[key] = parsed(read_text(name, kind)[0])
             except SceneError as error:
                 raise SceneError(f"{source}: {where} = {schema.shown(name)}: {error}") from None
 

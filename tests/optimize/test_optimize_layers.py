@@ -36,6 +36,8 @@ LEVEL = {
     "front_report": 7,
     "study_file": 7,
     "report": 8,
+    "comparison": 2,
+    "comparison_report": 7,
     "__init__": 9,
 }
 

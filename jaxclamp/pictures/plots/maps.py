@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -56,6 +56,30 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
             grid=False,
         )
         _view(view_axes, whole_grid(layer), zoom, scale, inside=number == 0, mark_P=P)
+    colour_bar(figure, scale, f"axial Cauchy stress (kPa){shades.said('volume')}", shades.beyond)
+    return figure
+
+
+def plot_axial_stress_side_by_side(results: Mapping[str, Clamped]) -> Picture:
+    """Axial Cauchy stress of the innermost layer in the last state of each result, on one colour scale."""
+    ends = {name: final_state(result) for name, result in results.items()}
+    layers = {name: layer_fields(kept.model, kept.state) for name, kept in ends.items()}
+    zoom = max(half_length_shown(results[name], known) for name, known in layers.items())
+    shades = stress_range([known[0] for known in layers.values()], zoom)
+    scale = ScalarMappable(Normalize(*shades.limits), stress_colours())
+    columns = min(3, len(results))
+    rows = -(-len(results) // columns)
+    figure = Picture(3.1 * columns + 0.8, 2.5 * rows + 0.4)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for number, (axes, (name, known)) in enumerate(zip(panels, layers.items(), strict=False)):
+        unrolled(axes, known[0], load_free_angles(results[name], 0), zoom, scale, mark_P=False)
+        dress(axes, "position along the artery (mm)", "angle from the fold (deg)", plain(name), grid=False)
+        axes.label_outer()
+        if number + columns >= len(results):  # nothing is below
+            axes.xaxis.set_tick_params(labelbottom=True)
+            axes.set_xlabel("position along the artery (mm)", fontsize=NORMAL, color=INK)
+    for axes in panels[len(results) :]:
+        axes.axis("off")
     colour_bar(figure, scale, f"axial Cauchy stress (kPa){shades.said('volume')}", shades.beyond)
     return figure
 

@@ -1,0 +1,167 @@
+"""Clamps compared on one artery: ranks and ties, the states, a clamp that fails, the command as typed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import jaxclamp as jc
+from jaxclamp.cli import main
+from optimize.comparison import Asked, Clamped, Comparison, asked_clamps, compare, lines, ranking, rise, tied
+
+SMALL = ["mesh.circumferential=5", "mesh.axial=8", "mesh.radial=[2, 1]"]
+LAYERS = ("media", "adventitia")
+
+
+def estimate(value: float, *sources: float | None) -> jc.Estimate:
+    return jc.Estimate(value, dict(zip("abcd", sources, strict=False)))
+
+
+def clamped(name: str, ranked: jc.Estimate | None, *failures: str) -> Clamped:
+    scene = jc.load_scene("human-lad", SMALL)
+    return Clamped(Asked(name, name, "", scene), ranked=ranked, failures=failures)
+
+
+def test_what_both_have_of_an_error_does_not_tie_them():
+    assert not tied(estimate(10.0, 3.0), estimate(11.0, 3.5))
+    assert tied(estimate(10.0, 3.0), estimate(11.0, 4.5))
+    assert tied(estimate(10.0, None), estimate(99.0, 1.0))  # nothing is known of the difference
+
+
+def test_ranks_of_ties_and_of_clamps_that_failed():
+    values = [estimate(10.0, 0.0), estimate(11.0, 2.0), estimate(14.0, 0.5), estimate(14.2, 0.8), None]
+    clamps = tuple(
+        clamped(name, value, *(["it slips"] if value is None else []))
+        for name, value in zip("abcde", values, strict=True)
+    )
+    by, measure = ranking("clamp_force", LAYERS)
+    found = Comparison("", by, measure, None, clamps)
+    assert [found.rank(place) for place in range(5)] == [1, 1, 3, 3, None]
+    table = lines(found)
+    assert table[1].startswith("1 =  a")
+    assert table[3].startswith("3 =  c")
+    assert table[5].startswith("–")
+    assert table[-1] == "e: it slips"
+
+
+@pytest.mark.parametrize(
+    ("asked", "name"),
+    [
+        (None, "smooth_peak_axial_stress_kPa.media"),
+        ("smooth_peak_axial_stress", "smooth_peak_axial_stress_kPa.media"),
+        ("smooth_peak_axial_stress_kPa.adventitia", "smooth_peak_axial_stress_kPa.adventitia"),
+        ("clamp_force_N", "clamp_force_N"),
+        ("clamp_force", "clamp_force_N"),
+    ],
+)
+def test_names_of_measures(asked, name):
+    assert ranking(asked, LAYERS)[0] == name
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("clamp_farce_N", "did you mean clamp_force_N"),
+        ("clamp_force_N.media", "not of a layer"),
+        ("smooth_peak_axial_stress_kPa.intima", "one of media, adventitia"),
+        ("volume_above", "no such measure"),
+    ],
+)
+def test_measures_that_there_are_not(asked, said):
+    with pytest.raises(jc.SceneError, match=said):
+        ranking(asked, LAYERS)
+
+
+@pytest.mark.parametrize(
+    ("clamps", "said"),
+    [
+        ("cylinder-3mm", "expected two or more"),
+        ("cylinder-3mm,cylinder-3mm", "is there twice"),
+        ("cylinder-3mm,cilinder-1mm", "cylinder-1mm"),
+        ("cylinder-3mm,no-such.toml", "there is no such file"),
+    ],
+)
+def test_clamps_that_there_are_not(clamps, said):
+    with pytest.raises(jc.SceneError, match=said):
+        asked_clamps("human-lad", clamps, SMALL)
+
+
+def test_rise_of_a_piecewise_linear_force():
+    """Slopes 1 up to 2 N, 4 from there: closed at 2 N, the last and the next half newton take 1/2 and 1/8."""
+    result = jc.clamp(jc.load_scene("human-lad", [*SMALL, "stop={ travel_mm = 0.2 }"]))
+    travel = np.array([0.1, 1.0, 2.0, 2.5])
+    force = np.where(travel <= 2.0, travel, 2.0 + 4.0 * (travel - 2.0))
+    known = [
+        {"stage": "clamping", "jaw_travel_mm": d, "clamp_force_N": F}
+        for d, F in zip(travel, force, strict=True)
+    ]
+
+    @dataclasses.dataclass
+    class Told:
+        history: list
+
+    assert result.history[-1]["stage"] == "clamping"
+    assert rise(Told(known), 2.0) == pytest.approx(4.0)
+    assert rise(Told(known), 3.5) is None  # pressed on by less than a quarter
+    known[2]["clamp_force_N"] = 0.5  # it snapped
+    assert rise(Told(known), 2.0) is None
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """A wide jaw, a narrow one, and one that slips between the contact points, from the command line."""
+    folder = tmp_path_factory.mktemp("compared")
+    sharp = folder / "sharp edge.toml"
+    sharp.write_text('# A wire\n#\n# made up\nshape = "cylinder"\nradius_mm = 0.05\n')
+    jaws = f"cylinder-3mm,cylinder-1mm,{sharp}"
+    options = [part for each in SMALL for part in ("--set", each)]
+    code = main(["compare", "human-lad", "--clamps", jaws, "--out", str(folder / "out"), "-q", *options])
+    return code, folder / "out"
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_it_found(compared):
+    code, out = compared
+    assert code == 0
+    content = json.loads((out / "compare.json").read_text())
+    assert (content["rank_by"], content["unit"]) == ("smooth_peak_axial_stress_kPa.media", "kPa")
+    assert [each["name"] for each in content["clamps"][:2]] == ["cylinder-3mm", "cylinder-1mm"]
+    wide, narrow, wire = content["clamps"]
+    assert wide["value"] < narrow["value"]
+    assert (wire["converged"], wire["rank"], wire["final"]) == (False, None, None)
+    assert "contact points" in wire["failure"]
+    assert (wire["title"], wire["source"]) == ("A wire", "made up")
+    for each in (wide, narrow):
+        assert each["final"]["occlusion"] == pytest.approx(0.925, abs=1e-6)
+        assert each["value"] == pytest.approx(each["final"]["smooth_peak_axial_stress_kPa"]["media"])
+        assert each["closed"]["closed"] is True
+        assert each["closing_force_N"] == pytest.approx(each["closed"]["clamp_force_N"])
+        assert each["at_equal_force"]["clamp_force_N"] == pytest.approx(content["force_N"], rel=1e-6)
+        assert each["rise_at_closure"] > 1.0
+    page = (out / "report.html").read_text()
+    assert "What did not converge" in page
+    assert page.count("<figure") == 3
+    assert (out / "clamps" / "cylinder-1mm" / "result.json").exists()
+
+
+@pytest.mark.slow
+def test_in_one_process_the_same():
+    scene = asked_clamps("human-lad", "cylinder-3mm,cylinder-1mm", SMALL)
+    by, measure = ranking("clamp_force_N", LAYERS)
+    found = compare(scene, by, measure, processes=1)
+    assert [each.asked.name for each in found.clamps] == ["cylinder-1mm", "cylinder-3mm"]
+    direct = jc.clamp(scene[0].scene).final["clamp_force_N"]
+    assert found.to_dict()["clamps"][1]["value"] == pytest.approx(direct, rel=1e-9)
+
+
+def test_bad_input_is_one_sentence(capsys, tmp_path):
+    jaws = ["--clamps", "cylinder-3mm,flat-2mm"]
+    assert main(["compare", "human-lad", *jaws, "--rank", "beauty", "--out", str(tmp_path / "x")]) == 2
+    said = capsys.readouterr().err
+    assert "no such measure" in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+    assert main(["compare", "human-lad", "--clamps", "cylinder-3mm"]) == 2
