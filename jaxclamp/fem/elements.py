@@ -5,8 +5,9 @@ Local axes are (radial, circumferential, axial). To add an element, add one entr
 q1p0 keeps the mean volume of a cell alone. Where a wall is compressed along its surface, cells that are long
 along the artery then buckle into waves that alternate along it with no mean change of volume, long before a
 surface does: at a stretch ratio of 0.54 for cells four times as long as wide, against 0.296 (Biot 1963). q1pz
-resists these waves by a second pressure, linear along the artery, with a modulus of ten shear moduli: enough
-for cells ten times as long as wide, and too little to lock (docs/closure.md).
+resists these waves by a second pressure, linear along the artery, whose modulus is the shear modulus times
+how long the cell is over across: enough for cells ten times as long as wide, and too little to lock
+(docs/closure.md).
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ class Element:
     pressure_axes: tuple[int, ...]
     """local axes along which a cell's pressure is linear; none: one pressure per cell (mean dilatation)"""
     linear_modulus: float | None
-    """modulus of the linear pressures, in shear moduli of the material; None: its bulk modulus"""
+    """modulus of the linear pressures, in shear moduli of the material, of a cell as long as wide; None: its
+    bulk modulus"""
     meshio_name: str
     """cell type in mesh files"""
     meshio_nodes: tuple[int, ...]
@@ -144,7 +146,7 @@ ELEMENTS = {
     e.name: e
     for e in (
         Element("q1p0", 1, (), None, "hexahedron", _vtk_order(1)),
-        Element("q1pz", 1, (2,), 10.0, "hexahedron", _vtk_order(1)),
+        Element("q1pz", 1, (2,), 1.0, "hexahedron", _vtk_order(1)),
         Element("q2p1", 2, (0, 1, 2), None, "hexahedron27", _vtk_order(2)),
     )
 }

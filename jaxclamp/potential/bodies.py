@@ -78,7 +78,8 @@ def solids(body: Body, stencils: Stencils) -> list[Solid]:
 def pressure_stiffness(solid: Solid, stencils: Stencils) -> Array:
     """Inverse of M = int N_m N_n / bulk dV of each cell, kPa/mm^3, (n_m, n_m, n_cells).
 
-    Where linear pressures have a modulus of their own (`Element.linear_modulus`), k, it is
+    Where linear pressures have a modulus of their own, k (`Element.linear_modulus` shear moduli times how
+    long the cell is along the artery over across it, h_z (h_r^-2 + h_theta^-2)^1/2), it is
     k (int N_m N_n dV)^-1 and what is missing to the bulk modulus in the mean pressure: a uniform change of
     volume has a uniform pressure, whatever the cell's form.
     """
@@ -87,7 +88,9 @@ def pressure_stiffness(solid: Solid, stencils: Stencils) -> Array:
     if linear is None:
         return jnp.moveaxis(jnp.linalg.inv(products(solid.dV / material.bulk)), 0, -1)
     V = jnp.sum(solid.dV, axis=0)
-    k = linear * jnp.sum(material.c * solid.dV, axis=0) / V
+    per_length = jnp.sqrt(jnp.sum(solid.to_local**2, axis=1))  # 2 / h along each local axis
+    elongation = jnp.hypot(per_length[0], per_length[1]) / per_length[2]
+    k = linear * jnp.sum(material.c * elongation * solid.dV, axis=0) / V
     mean = 1.0 / jnp.sum(solid.dV / material.bulk, axis=0)
     return (k * jnp.moveaxis(jnp.linalg.inv(products(solid.dV)), 0, -1)).at[0, 0].add(mean - k / V)
 

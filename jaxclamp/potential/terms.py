@@ -250,7 +250,7 @@ class Kind:
 
 KEPT = {
     "q1p0": "volume change averaged over each cell",
-    "q1pz": "volume change averaged over each cell; its axial slope resisted by 10 shear moduli",
+    "q1pz": "volume change averaged over each cell; its axial slope resisted softly",
     "q2p1": "pressure linear in each cell",
 }
 """how the cells of each element keep their volume"""

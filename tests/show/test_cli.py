@@ -203,7 +203,7 @@ def test_run_passes_overrides_and_fidelity_on(engine, capsys):
     (scene,) = engine.scenes
     assert (scene.clamp.jaw.radius, scene.stop.travel) == (1.5, 2.0)
     assert scene.mesh == schema.read(MeshSettings, mesh_for("draft", scene.artery), "mesh")
-    assert "note: --fidelity draft: on human-lad, errors of 5.0% in the" in err
+    assert "note: --fidelity draft: on human-lad, errors of 4.0% in the" in err
     assert "those of this scene are estimated at the end" in err
     assert "% in the jaw force" in err
 
