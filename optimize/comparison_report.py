@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from html import escape
@@ -23,6 +22,7 @@ from jaxclamp.pictures.plots.style import (
     dress,
     legend,
 )
+from jaxclamp.show.console import as_json
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
 from optimize.comparison import Clamped, Comparison, path, row
@@ -40,6 +40,8 @@ def write_comparison(
 ) -> list[Path]:
     """Write everything; returns the files to open."""
     tell = progress or (lambda event: None)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / TABLE, as_json(found.to_dict()) + "\n")  # first, whatever happens to pictures
     reached = [each for each in found.clamps if each.at_stop is not None]
     for place, each in enumerate(reached):
         tell(Progress("writing", place / (len(reached) + 1), each.asked.name))
@@ -51,7 +53,6 @@ def write_comparison(
         plates.append((plate, png(plate.figure)))
         write_bytes(folder / FIGURES / f"{plate.name}.png", plates[-1][1])
         write_bytes(folder / FIGURES / f"{plate.name}.svg", svg(plate.figure))
-    write_whole(folder / TABLE, json.dumps(found.to_dict(), indent=1, allow_nan=False) + "\n")
     write_whole(folder / PAGE, page(found, plates))
     tell(Progress("writing", 1.0, f"report in {folder}"))
     return [folder / PAGE, folder / TABLE]
@@ -102,12 +103,12 @@ def plot_ranking(found: Comparison, ranked: list[Clamped]) -> Picture:
     axes.invert_yaxis()
     dress(axes, f"{in_words(found.measure)} ({unit})" if unit else in_words(found.measure))
     faces = [profile(each.at_stop) for each in ranked if each.at_stop is not None]
-    wide = max(float(np.max(np.abs(face[0]))) for face in faces)
-    high = max(float(np.ptp(face[1])) for face in faces)
+    wide = max(float(np.nanmax(np.abs(face[0]))) for face in faces)
+    high = max(float(np.nanmax(face[1]) - np.nanmin(face[1])) for face in faces)
     for place, face in enumerate(faces):
         panel = figure.add_subplot(grid[place, 1])
         panel.plot(*face, color=FAINT, linewidth=1.5)
-        low = float(np.min(face[1]))
+        low = float(np.nanmin(face[1]))
         panel.set(xlim=(-wide, wide), ylim=(low - 0.1 * high, low + 1.1 * high), aspect="equal")
         panel.axis("off")
     return figure

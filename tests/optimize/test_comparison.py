@@ -10,7 +10,10 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
+from jaxclamp.pictures.plots import png
 from optimize.comparison import Asked, Clamped, Comparison, asked_clamps, compare, lines, ranking, rise, tied
+from optimize.comparison_report import plates_of
+from optimize.figures import profile
 
 SMALL = ["mesh.circumferential=5", "mesh.axial=8", "mesh.radial=[2, 1]"]
 LAYERS = ("media", "adventitia")
@@ -108,6 +111,20 @@ def test_rise_of_a_piecewise_linear_force():
     assert rise(Told(known), 3.5) is None  # pressed on by less than a quarter
     known[2]["clamp_force_N"] = 0.5  # it snapped
     assert rise(Told(known), 2.0) is None
+
+
+def test_faces_steeper_than_a_height_can_tell_are_drawn():
+    """The sides of a jaw with a sharp edge have no one height: their profile is not a number there."""
+    found = []
+    for name in ("cylinder-3mm", "wide-nearly-flat"):
+        few = [*SMALL, "stop={ travel_mm = 0.1 }", f"clamp.jaw={name}"]
+        result = jc.clamp(jc.load_scene("human-lad", few))
+        asked = Asked(name, name, "", result.scene)
+        found.append(Clamped(asked, at_stop=result, ranked=estimate(1.0 + len(found), 0.1)))
+    assert np.any(np.isnan(profile(found[1].at_stop)[1]))
+    plates = plates_of(Comparison("", *ranking(None, LAYERS), None, tuple(found)))
+    assert [plate.name for plate in plates] == ["ranking", "axial_stress"]
+    assert all(len(png(plate.figure, 50)) > 5000 for plate in plates)
 
 
 @pytest.fixture(scope="module")
