@@ -312,10 +312,15 @@ def _all(
 def path(result: Result) -> tuple[list[float], list[float]]:
     """Travel of each jaw, mm, and force on it, N, of the states on the way to a closed lumen and beyond.
 
-    Where the way was walked on a coarser mesh, its states up to the closed one are of that mesh.
+    Where the way was walked on a coarser mesh, its states up to the first of the scene's own are of that
+    mesh, as far as they lie before that one in both.
     """
     records = [record for record in result.history if record["stage"] == "clamping"]
-    return [r["jaw_travel_mm"] for r in records], [r["clamp_force_N"] for r in records]
+    points = [(r["jaw_travel_mm"], r["clamp_force_N"]) for r in records]
+    first = next(place for place, r in enumerate(records) if r["mesh"] == records[-1]["mesh"])
+    before = [p for p in points[:first] if all(a < b for a, b in zip(p, points[first], strict=True))]
+    travel, force = zip(*before, *points[first:], strict=True)
+    return list(travel), list(force)
 
 
 def rise(pressed: Result, closing_force_N: float) -> float | None:

@@ -11,7 +11,18 @@ import pytest
 import jaxclamp as jc
 from jaxclamp.cli import main
 from jaxclamp.pictures.plots import png
-from optimize.comparison import Asked, Clamped, Comparison, asked_clamps, compare, lines, ranking, rise, tied
+from optimize.comparison import (
+    Asked,
+    Clamped,
+    Comparison,
+    asked_clamps,
+    compare,
+    lines,
+    path,
+    ranking,
+    rise,
+    tied,
+)
 from optimize.comparison_report import plates_of
 from optimize.figures import profile
 
@@ -98,7 +109,7 @@ def test_rise_of_a_piecewise_linear_force():
     travel = np.array([0.1, 1.0, 2.0, 2.5])
     force = np.where(travel <= 2.0, travel, 2.0 + 4.0 * (travel - 2.0))
     known = [
-        {"stage": "clamping", "jaw_travel_mm": d, "clamp_force_N": F}
+        {"stage": "clamping", "mesh": "own", "jaw_travel_mm": d, "clamp_force_N": F}
         for d, F in zip(travel, force, strict=True)
     ]
 
@@ -109,6 +120,11 @@ def test_rise_of_a_piecewise_linear_force():
     assert result.history[-1]["stage"] == "clamping"
     assert rise(Told(known), 2.0) == pytest.approx(4.0)
     assert rise(Told(known), 3.5) is None  # pressed on by less than a quarter
+    coarser = {"stage": "clamping", "mesh": "coarser"}
+    way = [
+        coarser | {"jaw_travel_mm": d, "clamp_force_N": F} for d, F in ((0.05, 0.04), (2.1, 1.9), (1.9, 2.2))
+    ]
+    assert path(Told([*way, *known[2:]])) == ([0.05, 2.0, 2.5], [0.04, 2.0, 4.0])  # no step back
     known[2]["clamp_force_N"] = 0.5  # it snapped
     assert rise(Told(known), 2.0) is None
 
