@@ -260,7 +260,8 @@ def test_three_layers_of_three_laws_and_a_flat_jaw():
     )
     layers = (media, dataclasses.replace(adventitia, material=dispersed), skin)
     jaw = Flat(half_width=2.0, edge_radius=1.0)
-    result = jc.clamp(small(artery__layers=layers, mesh__radial=(2, 1, 1), clamp__jaw=jaw))
+    settings = mesh("q1pz", 6, 8, (2, 1, 1))  # the thin skin of long q1p0 cells crumples under the jaw
+    result = jc.clamp(small(artery__layers=layers, mesh=settings, clamp__jaw=jaw))
     assert_sound(result)
     assert set(result.final["peak_axial_stress_kPa"]) == {"media", "adventitia", "skin"}
 
