@@ -13,7 +13,15 @@ import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
-from jaxclamp.core.failures import EquilibriumError, Failure, SceneError, TooLittleMemory, Unfit, WorkerLost  # noqa: E402
+from jaxclamp.core.failures import (  # noqa: E402
+    BadFolder,
+    EquilibriumError,
+    Failure,
+    SceneError,
+    TooLittleMemory,
+    Unfit,
+    WorkerLost,
+)
 from jaxclamp.core.parts import by_value, own_parts  # noqa: E402
 from jaxclamp.core.progress import Progress  # noqa: E402
 from jaxclamp.core.records import quantity, record, static  # noqa: E402
@@ -67,6 +75,7 @@ from jaxclamp.trust.estimates import Estimate, Neighbours, neighbours, with_erro
 
 __all__ = [
     "MEASURES",
+    "BadFolder",
     "ClosedStop",
     "Equilibria",
     "EquilibriumError",

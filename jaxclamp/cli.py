@@ -264,7 +264,7 @@ def compare(
     """Put one artery into several clamps: at the scene's stop, just closed, and at equal force."""
     from optimize.comparison import asked_clamps, lines, ranking
     from optimize.comparison import compare as compare_clamps
-    from optimize.comparison_report import write_comparison
+    from optimize.comparison_report import require_ours, write_comparison
 
     _import(parts)
     asked = asked_clamps(scene, clamps, overrides or (), fidelity or "standard")
@@ -272,6 +272,7 @@ def compare(
     folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-compared")
     if folder is not None:
         folders.check(folder)
+        require_ours(folder)
     with console.progress(quiet) as progress:
         tell = progress if callable(progress) else None
         found = compare_clamps(asked, rank_by, measure, progress=tell)

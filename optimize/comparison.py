@@ -77,7 +77,7 @@ class Clamped:
     pressed: Result | None = None
     """with the common force"""
     failures: tuple[str, ...] = ()
-    """why what is missing is missing"""
+    """why what is missing is missing, or what is there may not be what a closing jaw comes to"""
 
     @property
     def closing_force_N(self) -> float | None:
@@ -247,12 +247,14 @@ def closing(asked: Asked, measure: Measure) -> Clamped:
         near = neighbours(reached)
         estimate = near.estimates((measure,))[measure]
         found = dataclasses.replace(found, at_stop=with_errors(reached, near), ranked=estimate)
+        found = _doubted(found, reached, "at the stop")
     except Failure as error:
         found = _failed(found, str(error))
     try:
         stop = ClosedStop(kind="closed", closed=True, closure=jnp.asarray(1.0))
         shut = dataclasses.replace(asked.scene, stop=stop)
-        return dataclasses.replace(found, closed=clamp(shut))
+        result = clamp(shut)
+        return _doubted(dataclasses.replace(found, closed=result), result, "closed")
     except Failure as error:
         return _failed(found, f"not closed: {error}")
 
@@ -264,9 +266,16 @@ def pressing(found: Clamped, force_N: float) -> Clamped:
     stop = PressedStop(kind="pressed", closed=True, force=jnp.asarray(1e3 * force_N))
     scene = dataclasses.replace(found.asked.scene, stop=stop)
     try:
-        return dataclasses.replace(found, pressed=clamp(scene))
+        result = clamp(scene)
+        return _doubted(dataclasses.replace(found, pressed=result), result, f"at {force_N:.4g} N")
     except Failure as error:
         return _failed(found, f"not pressed to {force_N:.4g} N: {error}")
+
+
+def _doubted(found: Clamped, result: Result, where: str) -> Clamped:
+    """The same, with a word where a closing jaw need not come to the result: as `run` warns of it."""
+    branch = str(result.solver["branch"] or "")
+    return _failed(found, f"{where}: {branch}") if branch.startswith("another") else found
 
 
 def _failed(found: Clamped, why: str) -> Clamped:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp import Progress
+from jaxclamp import BadFolder, Progress
 from jaxclamp.pictures.plots import Plate, png, svg
 from jaxclamp.pictures.plots.maps import plot_axial_stress_side_by_side
 from jaxclamp.pictures.plots.style import (
@@ -58,9 +58,17 @@ def write_comparison(
     return [folder / PAGE, folder / TABLE]
 
 
+def require_ours(folder: Path) -> None:
+    """Refuse a folder where a page or figures of something else would be replaced. Raises BadFolder."""
+    if (folder / TABLE).exists():
+        return
+    if there := next((name for name in (PAGE, FIGURES, CLAMPS) if (folder / name).exists()), None):
+        raise BadFolder(f"--out: {there} in {str(folder)!r} is not of a comparison: take another folder")
+
+
 def file_name(each: Clamped) -> str:
     """A folder's name for a clamp."""
-    return re.sub(r"[^\w.-]+", "-", each.asked.name.removesuffix(".toml")).strip("-.") or "clamp"
+    return re.sub(r"[^\w.-]+", "-", each.asked.name).strip("-.") or "clamp"
 
 
 def plates_of(found: Comparison) -> list[Plate]:
@@ -96,7 +104,8 @@ def plot_ranking(found: Comparison, ranked: list[Clamped]) -> Picture:
     grid = figure.add_gridspec(len(ranked), 2, width_ratios=[1.5, 1.0])
     axes = figure.add_subplot(grid[:, 0])
     values = [each.ranked.value / factor for each in ranked if each.ranked is not None]
-    errors = [(each.ranked.error or 0.0) / factor for each in ranked if each.ranked is not None]
+    known = [each.ranked.error for each in ranked if each.ranked is not None]
+    errors = [np.nan if error is None else error / factor for error in known]  # no bar where none is known
     places = np.arange(len(ranked))
     axes.barh(places, values, 0.55, xerr=errors, color=AXIAL, ecolor=INK, capsize=2.5)
     axes.set_yticks(places, [each.asked.name for each in ranked], fontsize=SMALL)
@@ -152,7 +161,7 @@ def page(found: Comparison, plates: list[tuple[Plate, bytes]]) -> str:
         section("Ranking", said + table(head, rows, 2)),
         figure_section(plates),
         section("At the scene's stop, closed, and at equal force", _figures(found)),
-        section("What did not converge", f"<ul>{''.join(failed)}</ul>" if failed else ""),
+        section("What failed, or is in doubt", f"<ul>{''.join(failed)}</ul>" if failed else ""),
         section("Clamps", table(["clamp", "what it is", "source of its numbers"], _sources(found), 3)),
     ]
     return document(found.title or "Comparison of clamps", sections)
