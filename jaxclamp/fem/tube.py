@@ -74,9 +74,8 @@ def supports(mesh: Mesh, settings: MeshSettings) -> np.ndarray:
     return held
 
 
-def _graded(n: int, grading: Array) -> Array:
-    """n numbers from 0 to 1, spaced ever wider: expm1(g s) / expm1(g), uniform for g = 0."""
-    s = jnp.linspace(0.0, 1.0, n)
+def _graded(s: Array | np.ndarray, grading: Array) -> Array:
+    """Shares s of a line's elements as shares of its length: expm1(g s) / expm1(g), ever wider."""
     curved = jnp.abs(grading) > 1e-6
     g = jnp.where(curved, grading, 1.0)
     straight_to_second_order = s + grading * s * (s - 1.0) / 2.0
@@ -86,7 +85,7 @@ def _graded(n: int, grading: Array) -> Array:
 def angles(mesh: Mesh, settings: MeshSettings) -> Array:
     """Angle of each circumferential grid line in the closed tube, rad, (n_c,); where it wraps, and 2 pi."""
     n = mesh.element.order * settings.circumferential
-    share = _graded(n + 1, settings.circumferential_grading)  # of a right angle, from the fold
+    share = _graded(np.linspace(0.0, 1.0, n + 1), settings.circumferential_grading)  # of a right angle
     first, last = symmetry_of(settings.symmetry).quarters
     lines = [k + share if k % 2 == 0 else k + 1 - share[::-1] for k in range(first, last)]
     return 0.5 * jnp.pi * jnp.concatenate([lines[0], *(line[1:] for line in lines[1:])])
@@ -94,14 +93,32 @@ def angles(mesh: Mesh, settings: MeshSettings) -> Array:
 
 def axial_fractions(mesh: Mesh, settings: MeshSettings) -> Array:
     """Position of each axial grid line over half the length, 0 at the clamp to 1 at the end, (n_z,)."""
-    half = _graded(mesh.element.order * settings.axial + 1, settings.axial_grading)
+    half = _graded(np.linspace(0.0, 1.0, mesh.element.order * settings.axial + 1), settings.axial_grading)
     return half if mesh.grid[2] == half.shape[0] else jnp.concatenate([-half[:0:-1], half])
 
 
+def through(share: np.ndarray, settings: MeshSettings, layer: int) -> Array:
+    """Place in a layer, 0 inside to 1 outside, below which a share of its radial elements lies.
+
+    Nodes inside an element are evenly spaced.
+    """
+    if layer == 0:
+        return jnp.asarray(share)
+    ends = np.linspace(0.0, 1.0, settings.radial[layer] + 1)
+    return jnp.interp(jnp.asarray(share), ends, _graded(ends, settings.radial_grading))
+
+
+def radial_places(mesh: Mesh, settings: MeshSettings) -> Array:
+    """Number of the layer plus place through it, 0 to 1, of each radial grid line, (n_r,)."""
+    layers = np.asarray(mesh.node_layer)
+    within = [mesh.node_fraction[layers == k] for k in range(len(mesh.layer_cells))]
+    return jnp.concatenate([through(share, settings, k) + k for k, share in enumerate(within)])
+
+
 @jax.jit
-def grid_lines(mesh: Mesh, settings: MeshSettings) -> tuple[Array, Array]:
-    """`axial_fractions` and `angles`, in one program."""
-    return axial_fractions(mesh, settings), angles(mesh, settings)
+def grid_lines(mesh: Mesh, settings: MeshSettings) -> tuple[Array, Array, Array]:
+    """`axial_fractions`, `angles` and `radial_places`, in one program."""
+    return axial_fractions(mesh, settings), angles(mesh, settings), radial_places(mesh, settings)
 
 
 def _heights(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
@@ -125,14 +142,15 @@ def stress_free_positions(mesh: Mesh, settings: MeshSettings, artery: Artery) ->
     angle = angles(mesh, settings)[mesh.cell_line]
     height = _heights(mesh, settings, artery)[mesh.cells // (n_r * n_c)]
     radius, opened = [], []
-    for layer, (first, last) in zip(artery.layers, mesh.layer_cells, strict=True):
-        radius.append(layer.inner_radius + layer.thickness * mesh.cell_fraction[:, first:last])
+    for k, (layer, (first, last)) in enumerate(zip(artery.layers, mesh.layer_cells, strict=True)):
+        place = through(mesh.cell_fraction[:, first:last], settings, k)
+        radius.append(layer.inner_radius + layer.thickness * place)
         opened.append(angle[:, first:last] * sector_share(layer.opening_angle))
     R, phi = jnp.concatenate(radius, axis=1), jnp.concatenate(opened, axis=1)
     return jnp.stack([R * jnp.cos(phi), R * jnp.sin(phi), height])
 
 
-def closed_radii(mesh: Mesh, artery: Artery) -> Array:
+def closed_radii(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Array:
     """A guess of the load-free radius of each radial grid line, mm, (n_r,).
 
     The incompressible closing map r**2 = r_i**2 + (R**2 - R_i**2) / k. The innermost layer keeps
@@ -140,9 +158,10 @@ def closed_radii(mesh: Mesh, artery: Artery) -> Array:
     A square that is not positive marks layers that cannot close.
     """
     inner_squared, squares = None, []
+    places = radial_places(mesh, settings)
     for number, layer in enumerate(artery.layers):
         share = sector_share(layer.opening_angle)
-        R = layer.inner_radius + layer.thickness * mesh.node_fraction[np.asarray(mesh.node_layer) == number]
+        R = layer.inner_radius + layer.thickness * (places[np.asarray(mesh.node_layer) == number] - number)
         if inner_squared is None:
             middle = layer.inner_radius + 0.5 * layer.thickness
             inner_squared = (middle * share) ** 2 - (middle**2 - layer.inner_radius**2) * share
@@ -156,6 +175,6 @@ def closed_positions(mesh: Mesh, settings: MeshSettings, artery: Artery) -> Arra
     """A guess of the load-free position of each node, mm, (n_nodes, 3)."""
     around = angles(mesh, settings)[: mesh.grid[1]]
     z, theta, r = jnp.meshgrid(
-        _heights(mesh, settings, artery), around, closed_radii(mesh, artery), indexing="ij"
+        _heights(mesh, settings, artery), around, closed_radii(mesh, settings, artery), indexing="ij"
     )
     return jnp.stack([r * jnp.cos(theta), r * jnp.sin(theta), z], axis=-1).reshape(-1, 3)

@@ -117,6 +117,10 @@ class MeshSettings:
     circumferential_grading: Array = quantity("", 0.0, 6.0, default=0.0)
     """elements grow by exp(grading) from the fold to the compression axis; 0 is uniform. In a file that does
     not say: `fidelity.grading`"""
+    radial_grading: Array = quantity("", 0.0, 6.0, default=0.0)
+    """elements of all layers but the innermost grow by exp(grading) from the inside of their layer, where the
+    fibres of a softer layer stiffen, to its outside; 0 is uniform. In a file that does not say:
+    `fidelity.radial_grading`"""
     element: str = static("q1pz", choices=("q1pz", "q1p0", "q2p1"))
     """q1p0: 8 nodes, mean dilatation; q1pz: the same, stable against axial waves at a sharp fold; q2p1: 27
     nodes, linear discontinuous pressure"""

@@ -45,17 +45,17 @@ RADIAL = 2
 
 def _lines(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Place of each axial, circumferential and radial grid line in the artery: the same on every mesh."""
-    mesh, settings = model.mesh, model.scene.mesh
-    axial, around = jax.device_get(grid_lines(mesh, settings))
-    return axial, around, np.asarray(mesh.node_layer) + mesh.node_fraction
+    axial, around, radial = jax.device_get(grid_lines(model.mesh, model.scene.mesh))
+    return axial, around, radial
 
 
 def _middles(model: Model, layer: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Place of the middles of a layer's cells along each axis."""
-    axial, circumferential, _ = (line[:: model.mesh.element.order] for line in _lines(model))
-    count = model.scene.mesh.radial[layer]
+    axial, circumferential, radial = (line[:: model.mesh.element.order] for line in _lines(model))
+    inside = sum(model.scene.mesh.radial[:layer])
+    radial = radial[inside : inside + model.scene.mesh.radial[layer] + 1]
     between = lambda line: 0.5 * (line[1:] + line[:-1])  # noqa: E731
-    return between(axial), between(circumferential), (np.arange(count) + 0.5) / count
+    return between(axial), between(circumferential), between(radial)
 
 
 def _smooth(values: np.ndarray, known: np.ndarray, wanted: np.ndarray, axis: int) -> np.ndarray:

@@ -81,6 +81,7 @@ def scene_table(jaw, stop, first=HGO, second=HGO):
             "radial": [5, 3],
             "axial_grading": 2.5,
             "circumferential_grading": 0.5,
+            "radial_grading": 1.5,
             "element": "q1p0",
             "contact_points": 4,
             "symmetry": "xz",
@@ -105,7 +106,7 @@ OPTIONAL = {"title", "contact", "mesh", "solver", "fibre_energy", "fibre_invaria
 MAY_BE_NEGATIVE = {"opening_angle_deg", "slopes"}
 MAY_BE_ZERO = MAY_BE_NEGATIVE | {
     *("pressure_kPa", "k1_kPa", "k2", "fibre_angle_deg", "dispersion", "travel_mm"),
-    *("axial_grading", "circumferential_grading"),
+    *("axial_grading", "circumferential_grading", "radial_grading"),
 }
 
 
@@ -222,7 +223,7 @@ def test_human_lad_is_the_study_of_2002():
     assert (scene.contact.stiffness, scene.contact.smoothing) == (2000.0, 0.01)
     mesh = load_scene("human-lad", fidelity="seed").mesh
     assert (mesh.circumferential, mesh.axial, mesh.radial, mesh.axial_grading) == (10, 15, (5, 3), 2.5)
-    assert (mesh.element, mesh.circumferential_grading) == ("q1p0", 0.0)
+    assert (mesh.element, mesh.circumferential_grading, mesh.radial_grading) == ("q1p0", 0.0, 0.0)
     assert [layer.name for layer in scene.artery.layers] == ["media", "adventitia"]
 
 
@@ -472,7 +473,7 @@ def test_layers_are_refused_exactly_where_the_closing_map_has_no_radius(angle):
     inner_squared = (middle * share) ** 2 - (middle**2 - layer["inner_radius_mm"] ** 2) * share
     if inner_squared > 0:
         scene = loads(table)
-        radii = np.asarray(closed_radii(build_tube(scene.mesh), scene.artery))
+        radii = np.asarray(closed_radii(build_tube(scene.mesh), scene.mesh, scene.artery))
         assert np.all(np.diff(radii) > 0)
         assert radii[0] > 0
     else:
@@ -524,7 +525,7 @@ def test_numbers_become_floats_in_internal_units():
     [
         ("draft", (10, 10, (3, 2))),
         ("standard", (14, 15, (5, 3))),
-        ("reference", (20, 30, (10, 6))),
+        ("reference", (28, 36, (10, 6))),
         ("seed", (10, 15, (5, 3))),
     ],
 )
@@ -534,6 +535,9 @@ def test_fidelity_chooses_the_mesh_where_the_scene_does_not(fidelity, counts):
     assert mesh.axial_grading == 2.5
     uniform = fidelity == "seed"
     assert (mesh.element, mesh.circumferential_grading) == (("q1p0", 0.0) if uniform else ("q1pz", 2.0))
+    assert mesh.radial_grading == (0.0 if uniform else 5.0)  # the adventitia is softer than the media
+    harder = load_scene("human-lad", ["artery.layers[1].material.c_kPa=28"], fidelity).mesh
+    assert harder.radial_grading == 0.0
     few = load_scene("human-lad", ["mesh.circumferential=9"], fidelity).mesh
     assert few.circumferential_grading == 0.0  # an element on the other side would cover 20 degrees
     mixed = load_scene("human-lad", ["mesh.axial=33"], fidelity).mesh

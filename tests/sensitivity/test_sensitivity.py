@@ -63,7 +63,7 @@ BODIES = {
 }
 """without the clamp"""
 
-GRADING = "mesh.circumferential_grading=0.5"
+GRADING = "mesh.circumferential_grading=0.5", "mesh.radial_grading=1.5"
 """inside its range: differences go both ways"""
 
 
@@ -76,8 +76,8 @@ def clamped(stop: str) -> jc.Result:
         *((STOPS[stop],) if stop in STOPS else BODIES[stop]),
         "mesh.circumferential=4",
         "mesh.axial=6",
-        "mesh.radial=[2, 1]",
-        GRADING,
+        "mesh.radial=[2, 2]",
+        *GRADING,
     ]
     return solver(stop)(tight(jc.load_scene("human-lad", overrides)))
 
@@ -93,7 +93,7 @@ def one_layer() -> jc.Result:
     scene = jc.load_scene("human-lad", [f"clamp.jaw={JAW}"])
     artery = dataclasses.replace(scene.artery, layers=scene.artery.layers[:1])
     text = jc.dump_scene(dataclasses.replace(scene, artery=artery, mesh=mesh("q1p0", 4, 6, (2,))))
-    return jc.clamp(tight(loads_scene(text, overrides=[*counts, STOPS["half closed"], GRADING])))
+    return jc.clamp(tight(loads_scene(text, overrides=[*counts, STOPS["half closed"], *GRADING])))
 
 
 @functools.cache

@@ -41,9 +41,10 @@ def test_onto_the_same_mesh_nothing_changes(coarse):
         {"circumferential": 4, "axial": 5, "radial": (1, 1)},
         {"axial_grading": 0.5, "circumferential_grading": 1.0},
         {"axial_grading": 0.4, "circumferential_grading": 0.25},
+        {"radial": (2, 4), "radial_grading": 3.0},
         {"element": "q2p1"},
     ],
-    ids=["finer", "coarser", "graded", "graded, ending by rounding", "quadratic"],
+    ids=["finer", "coarser", "graded", "graded, ending by rounding", "graded through", "quadratic"],
 )
 @pytest.mark.parametrize("back", [False, True])
 def test_a_round_tube_stays_round(coarse, mesh, back):
