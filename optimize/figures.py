@@ -101,7 +101,7 @@ def plot_contact(study: Study) -> Picture:
     for name, result in shown(study).items():
         z, pressure = contact_along(result.model, result.states[-1].state)
         axes.plot(z, pressure, color=COLOURS[name], linewidth=2.2 if name == "best" else 1.4, label=name)
-    reach = max(float(result.scene.clamp.jaw.half_extent()) for result in shown(study).values())
+    reach = max(result.scene.clamp.half_extent() for result in shown(study).values())
     axes.set_xlim(-1.1 * reach, 1.1 * reach)
     dress(axes, "position along the artery (mm)", "highest contact pressure (kPa)")
     axes.set_ylim(bottom=0.0)

@@ -25,6 +25,8 @@ class Mesh:
     """nodes along (radial, circumferential, axial)"""
     wraps: bool = static(default=False)
     """the circumferential direction is closed: its first grid line comes after its last"""
+    planes: str = static(default="")
+    """mirror planes of a tube, by the letters of their normals"""
     radial: tuple[int, ...] = static()
     """cells through each layer"""
     cells: np.ndarray

@@ -11,7 +11,7 @@ from jax import Array
 from jaxclamp.core.records import record, static
 from jaxclamp.fem.elements import Element, gauss, lagrange
 from jaxclamp.fem.grid import Mesh
-from jaxclamp.fem.symmetry import Symmetry, symmetry_of
+from jaxclamp.fem.symmetry import Symmetry
 from jaxclamp.fem.tube import circumferential_line, middle_line
 from jaxclamp.scenes.scene import MeshSettings
 
@@ -28,6 +28,8 @@ class Landmarks:
     """inner surface at mid-length, round the modelled part (closed where it wraps), (n,)"""
     lumen_line: np.ndarray
     """inner surface on the compression axis, along the modelled part, (n,)"""
+    opposite_line: np.ndarray | None
+    """its mirror image, where that is modelled, (n,)"""
     outer_top: int = static()
     """outer surface, compression axis, mid-length"""
     P_layer: int = static()
@@ -78,18 +80,20 @@ def find_landmarks(mesh: Mesh, settings: MeshSettings, layer_names: tuple[str, .
     corner = int(np.flatnonzero(np.all(element.node_grid == [0, element.order, 0], axis=1))[0])
     cell = int(np.flatnonzero(mesh.cells[corner, first:last] == P)[0])
     ring = range(mesh.grid[1] + mesh.wraps)
+    line = lambda c: np.array([mesh.node(0, c, z) for z in range(mesh.grid[2])])  # noqa: E731
     return Landmarks(
         lumen_top=mesh.node(0, top, middle),
         lumen_bottom=None if bottom is None else mesh.node(0, bottom, middle),
         lumen_ring=np.array([mesh.node(0, c % mesh.grid[1], middle) for c in ring]),
-        lumen_line=np.array([mesh.node(0, top, z) for z in range(mesh.grid[2])]),
+        lumen_line=line(top),
+        opposite_line=None if bottom is None else line(bottom),
         outer_top=mesh.node(-1, top, middle),
         P_layer=layer,
         P_cell=cell,
         P_weights=extrapolation(element)[corner],
         layer_names=layer_names,
         element=element,
-        symmetry=symmetry_of(settings.symmetry),
+        symmetry=Symmetry(mesh.planes),
     )
 
 
@@ -127,9 +131,14 @@ def lumen_area(x: Array, marks: Landmarks) -> Array:
 def lumen_opening(x: Array, marks: Landmarks) -> Array:
     """Greatest height of the lumen at mid-length over its width, mm: of what is left beside the fold, too.
 
-    Where the lower half is modelled, too, twice the greatest height above or below the axis.
+    Where the lower half is modelled, too, between opposite nodes.
     """
-    return 2.0 * jnp.max(jnp.abs(x[marks.lumen_ring, 1]))
+    heights = x[marks.lumen_ring, 1]
+    if marks.lumen_bottom is None:
+        return 2.0 * jnp.max(jnp.abs(heights))
+    return jnp.max(
+        jnp.abs(heights - heights[::-1])
+    )  # the fold is in the middle of the ring, or where it closes
 
 
 def closed_length(x: Array, marks: Landmarks, height: Array) -> Array:
@@ -138,7 +147,8 @@ def closed_length(x: Array, marks: Landmarks, height: Array) -> Array:
     Linear between the nodes; x: positions, (n_nodes, 3)
     """
     line = x[marks.lumen_line]
-    y, dz = line[:, 1] - 0.5 * height, jnp.diff(line[:, 2])
+    below = line * jnp.array([1.0, -1.0, 1.0]) if marks.opposite_line is None else x[marks.opposite_line]
+    y, dz = 0.5 * (line[:, 1] - below[:, 1] - height), jnp.diff(0.5 * (line[:, 2] + below[:, 2]))
     a, b = jnp.minimum(y[:-1], y[1:]), jnp.maximum(y[:-1], y[1:])
     crossing = (a < 0.0) & (b > 0.0)
     share = jnp.where(crossing, -a / jnp.where(crossing, b - a, 1.0), jnp.where(b <= 0.0, 1.0, 0.0))

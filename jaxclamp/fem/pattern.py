@@ -61,6 +61,8 @@ class Layout:
     """degree of freedom 3 node + component of each unknown, (n_free,)"""
     n_nodes: int = static()
     """nodes of all bodies"""
+    n_rigid: int = static(default=1)
+    """rigid coordinates"""
 
 
 def block_size(points_per_cell: int) -> int:
@@ -69,12 +71,13 @@ def block_size(points_per_cell: int) -> int:
 
 
 def build_pattern(
-    held: np.ndarray, regions: Mapping[str, tuple[np.ndarray, int]]
+    held: np.ndarray, regions: Mapping[str, tuple[np.ndarray, int]], n_rigid: int = 1
 ) -> tuple[Layout, dict[str, Region], Pattern]:
     """Number the unknowns and find the place of every matrix entry in the sparse tangent.
 
     held: True for degrees of freedom that are no unknowns, (n_nodes, 3)
     regions: by name, the nodes of cells or facets (n_en, n_cells) and the cells of a block
+    n_rigid: rigid coordinates, which are no unknowns of the tangent
     """
     free = np.flatnonzero(~held.ravel())
     unknown = np.full(held.size, -1)
@@ -99,7 +102,7 @@ def build_pattern(
     rows, indices = np.divmod(distinct[skipped:], n)
     indptr = np.searchsorted(rows, np.arange(n + 1))
     found = {name: Region(nodes=nodes.astype(np.int32), size=size) for name, (nodes, size) in regions.items()}
-    layout = Layout(free=free.astype(np.int32), n_nodes=len(held))
+    layout = Layout(free=free.astype(np.int32), n_nodes=len(held), n_rigid=n_rigid)
     return layout, found, Pattern(indptr.astype(np.int32), indices.astype(np.int32), places)
 
 

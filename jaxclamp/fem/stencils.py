@@ -28,6 +28,12 @@ class FacetRule:
         return self.surface[:, :1]
 
     @property
+    def of_two(self) -> np.ndarray:
+        """Stencil of the places and tangents of a facet and of another whose nodes follow, (n_q, 6, 2 n_fn)."""
+        nothing = np.zeros_like(self.surface)
+        return np.block([[self.surface, nothing], [nothing, self.surface]])
+
+    @property
     def dN(self) -> np.ndarray:
         """Stencil of the tangents, (n_q, 2, n_fn)."""
         return self.surface[:, 1:]

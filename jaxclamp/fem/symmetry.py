@@ -11,6 +11,8 @@ import dataclasses
 
 import numpy as np
 
+from jaxclamp.scenes.scene import Clamp, MeshSettings
+
 AXES = "xyz"
 
 
@@ -33,8 +35,8 @@ class Symmetry:
     def parts_of_a_jaw(self) -> float:
         """Factor from the force that belongs to the jaws' height in the model to that on one whole jaw.
 
-        With the plane y = 0 the model holds one jaw only. Without it, two jaws alike share one height, and
-        each takes half of the force.
+        With the plane y = 0 the model holds one jaw only. Without it, two jaws share one height, and each
+        takes half of the force.
         """
         return self.parts / 2.0
 
@@ -47,6 +49,11 @@ class Symmetry:
     def share(self) -> str:
         """The modelled part: "1/8", "1/4", "1/2" or "1"."""
         return "1" if self.parts == 1 else f"1/{self.parts}"
+
+    @property
+    def rigid_coordinates(self) -> int:
+        """The jaws' height above the clamp's middle, and, without the plane y = 0, how high that lies."""
+        return 1 if "y" in self else 2
 
     # --- spans ------------------------------------------------------------------------------------
 
@@ -79,10 +86,10 @@ class Symmetry:
         names = {8: "one eighth", 4: "one quarter", 2: "one half"}
         planes = ", ".join(f"{axis} = 0" for axis in AXES if axis in self)
         plane = "mirror planes" if len(self.planes) > 1 else "mirror plane"
-        held = "" if "x" in self and "y" in self else "; its ends are held across where a plane is missing"
+        held = "" if "x" in self and "y" in self else "; the ends are held across where a plane is missing"
         return (
-            f"{names[self.parts]}: {around} by {along} ({plane} {planes}), because both jaws are "
-            f"alike and the clamp sits in the middle{held}"
+            f"{names[self.parts]}: {around} by {along} ({plane} {planes}, which artery and clamp have in "
+            f"common{held})"
         )
 
     @property
@@ -97,9 +104,9 @@ class Symmetry:
         return signs
 
 
-def symmetry_of(choice: str) -> Symmetry:
-    """The symmetry that a scene's `mesh.symmetry` asks for.
+def symmetry_of(settings: MeshSettings, clamp: Clamp) -> Symmetry:
+    """The symmetry that a scene's mesh asks for; "auto": all planes that hold.
 
-    "auto": all planes that hold. Two jaws alike that close across a straight artery have all three.
+    They hold in a straight artery and in what the clamp's jaws share.
     """
-    return Symmetry({"auto": AXES, "none": ""}.get(choice, choice))
+    return Symmetry({"auto": clamp.planes, "none": ""}.get(settings.symmetry, settings.symmetry))

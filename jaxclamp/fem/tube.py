@@ -11,32 +11,30 @@ a model of more than that is the same mesh, mirrored. Positions are functions of
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxclamp.fem.grid import Mesh, build_block
-from jaxclamp.fem.symmetry import symmetry_of
-from jaxclamp.scenes.scene import Artery, MeshSettings
+from jaxclamp.fem.symmetry import Symmetry, symmetry_of
+from jaxclamp.scenes.scene import Artery, Clamp, MeshSettings
 
 
-def build_tube(settings: MeshSettings) -> Mesh:
+def build_tube(settings: MeshSettings, clamp: Clamp) -> Mesh:
     """Topology of the modelled part of the tube."""
-    symmetry = symmetry_of(settings.symmetry)
+    symmetry = symmetry_of(settings, clamp)
     around, along = (span[1] - span[0] for span in (symmetry.quarters, symmetry.halves))
-    return build_block(
-        settings.element,
-        settings.radial,
-        around * settings.circumferential,
-        along * settings.axial,
-        symmetry.wraps,
-    )
+    counts = around * settings.circumferential, along * settings.axial
+    block = build_block(settings.element, settings.radial, *counts, symmetry.wraps)
+    return dataclasses.replace(block, planes=symmetry.planes)
 
 
 def circumferential_line(mesh: Mesh, settings: MeshSettings, quarter: int) -> int | None:
     """Grid line at so many right angles from the fold; None where that is not modelled."""
-    first, last = symmetry_of(settings.symmetry).quarters
+    first, last = Symmetry(mesh.planes).quarters
     if mesh.wraps:
         return mesh.element.order * settings.circumferential * (quarter % 4)
     inside = [k for k in (quarter, quarter - 4, quarter + 4) if first <= k <= last]
@@ -45,12 +43,12 @@ def circumferential_line(mesh: Mesh, settings: MeshSettings, quarter: int) -> in
 
 def middle_line(mesh: Mesh, settings: MeshSettings) -> int:
     """Axial grid line at mid-length."""
-    return -symmetry_of(settings.symmetry).halves[0] * settings.axial * mesh.element.order
+    return -Symmetry(mesh.planes).halves[0] * settings.axial * mesh.element.order
 
 
-def end_lines(settings: MeshSettings) -> tuple[int, ...]:
+def end_lines(mesh: Mesh) -> tuple[int, ...]:
     """Axial grid lines at the artery's ends."""
-    return (-1,) if "z" in symmetry_of(settings.symmetry) else (0, -1)
+    return (-1,) if "z" in mesh.planes else (0, -1)
 
 
 def supports(mesh: Mesh, settings: MeshSettings) -> np.ndarray:
@@ -61,9 +59,9 @@ def supports(mesh: Mesh, settings: MeshSettings) -> np.ndarray:
     keep their place across along their horizontal (vertical) diameter, where a mirror plane would hold
     them. No force and no parameter is added: where the mirror plane holds, those supports carry nothing.
     """
-    symmetry = symmetry_of(settings.symmetry)
+    symmetry = Symmetry(mesh.planes)
     held = np.zeros((mesh.n_nodes, 3), dtype=bool)
-    ends = np.concatenate([mesh.plane(2, line) for line in end_lines(settings)])
+    ends = np.concatenate([mesh.plane(2, line) for line in end_lines(mesh)])
     for component, axis, quarters in ((0, "x", (1, 3)), (1, "y", (0, 2))):
         lines = [circumferential_line(mesh, settings, quarter) for quarter in quarters]
         for nodes in (mesh.plane(1, line) for line in lines if line is not None):
@@ -86,7 +84,7 @@ def angles(mesh: Mesh, settings: MeshSettings) -> Array:
     """Angle of each circumferential grid line in the closed tube, rad, (n_c,); where it wraps, and 2 pi."""
     n = mesh.element.order * settings.circumferential
     share = _graded(np.linspace(0.0, 1.0, n + 1), settings.circumferential_grading)  # of a right angle
-    first, last = symmetry_of(settings.symmetry).quarters
+    first, last = Symmetry(mesh.planes).quarters
     lines = [k + share if k % 2 == 0 else k + 1 - share[::-1] for k in range(first, last)]
     return 0.5 * jnp.pi * jnp.concatenate([lines[0], *(line[1:] for line in lines[1:])])
 

@@ -15,25 +15,31 @@ from jaxclamp.observe.measures import jaw_forces
 from jaxclamp.observe.stresses import noise
 from jaxclamp.potential.densities import swept_volume
 from jaxclamp.potential.energy import energy, group_energy, group_points, lumen_volume
-from jaxclamp.potential.terms import BLOOD, INTIMA, JAWS, Potential
+from jaxclamp.potential.terms import BLOOD, INTIMA, JAWS, Group, Potential
 
 
 def between_walls(potential: Potential, x: Array) -> Array:
-    """Force with which the inner walls press on each other in the modelled part, by side, mN, (n_sides,)."""
+    """Force between the inner walls of the modelled part, summed over those walls, mN."""
 
-    def at(planes: Array) -> Array:
-        groups = potential.of(INTIMA)
-        inner = [next(term for term in g.terms if term.name == INTIMA) for g in groups]
-        moved = [
-            dataclasses.replace(term, here=dataclasses.replace(term.here, plane=plane))
-            for term, plane in zip(inner, planes, strict=True)
-        ]
-        placed = [dataclasses.replace(g, terms=(term,)) for g, term in zip(groups, moved, strict=True)]
-        return total(group_energy(group, x, jnp.zeros(0)) for group in placed)
+    def at(plane: Array) -> Array:
+        moved = potential.changed(INTIMA, lambda here: dataclasses.replace(here, plane=plane))
+        return total(_energy_of(INTIMA, group, x, jnp.zeros(0)) for group in moved.of(INTIMA))
 
-    groups = potential.of(INTIMA)
-    sides = jnp.asarray([group.here(INTIMA).side for group in groups], float)
-    return sides * jax.grad(at)(jnp.zeros(len(groups)))
+    return jax.grad(at)(jnp.zeros(()))
+
+
+def _energy_of(name: str, group: Group, x: Array, q: Array) -> Array:
+    """The part of one term of a group, uJ."""
+    alone = tuple(term for term in group.terms if term.name == name)
+    return group_energy(dataclasses.replace(group, terms=alone), x, q)
+
+
+def _lifting_forces(e: Equilibria, name: str) -> Array:
+    """Vertical force of the wall on what a term presses it against, by group, mN, (n_groups,)."""
+    up = jnp.zeros_like(e.last.x).at[:, 1].set(1.0)
+    along = lambda group, x: _energy_of(name, group, x, e.last.q)  # noqa: E731
+    of = lambda group: jax.jvp(lambda x: along(group, x), (e.last.x,), (up,))[1]  # noqa: E731
+    return jnp.stack([of(group) for group in e.potential.of(name)])
 
 
 @record
@@ -56,7 +62,8 @@ class Balance:
 
 
 def balance(e: Equilibria) -> Balance:
-    """Vertical balance of the modelled part: supports, pressure and inner walls against the jaws.
+    """Vertical balance of the modelled part: supports, pressure and inner walls against the jaws; and, where
+    both are modelled, of the jaws against each other.
 
     Relative to the largest of them, or, where all vanish, to a thousandth of the wall's other forces, or to
     what rounding leaves of none.
@@ -69,18 +76,20 @@ def balance(e: Equilibria) -> Balance:
     stored, elastic = stored + of_surfaces, elastic + on_surfaces
     volume, swelling = jax.value_and_grad(lumen_volume, argnums=1)(e.potential, x)
     jaws, inner = jaw_forces(e.potential, x, q), between_walls(e.potential, x)
-    up = jnp.asarray([float(group.here(JAWS).side) for group in e.potential.of(JAWS)])
+    lifted = [_lifting_forces(e, name) for name in (JAWS, INTIMA)]
     held = jnp.ones(x.size).at[free].set(0.0).reshape(x.shape)[:, 1]
     pushed = pressure * _lifting(e)
     supports = (elastic[:, 1] - pushed) * held
-    imbalance = jnp.abs(jnp.sum(supports) + jnp.sum(pushed) + up @ inner - up @ jaws)
+    imbalance = jnp.abs(jnp.sum(supports) + jnp.sum(pushed) - total(map(jnp.sum, lifted)))
+    if len(jaws) > 1:
+        imbalance = jnp.maximum(imbalance, jnp.abs(jnp.sum(lifted[0])))
     sizes = [jnp.max(jnp.abs(jaws)), jnp.sum(pushed), jnp.sum(jnp.abs(supports))]
     largest = jnp.max(jnp.stack(sizes))
     return Balance(
         energy=e.marks.symmetry.parts * (stored - pressure * volume),
         residual=jnp.linalg.norm((elastic - pressure * swelling).ravel()[free]),
         jaw_force=e.marks.symmetry.parts_of_a_jaw * jnp.sum(jaws),
-        inner_force=e.marks.symmetry.parts_of_a_jaw * jnp.sum(inner),
+        inner_force=e.marks.symmetry.parts_of_a_jaw * inner,
         error=imbalance / (jnp.maximum(largest, 1e-3 * jnp.linalg.norm(elastic)) + _noise(e)),
     )
 

@@ -8,10 +8,11 @@ from jax import Array
 
 from jaxclamp.core.tensors import cross, norm, total
 from jaxclamp.fem.landmarks import closed_length, lumen_area, lumen_height, lumen_opening
+from jaxclamp.fem.stencils import FacetRule
 from jaxclamp.observe.balance import between_walls
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measures import force_on_a_jaw
-from jaxclamp.potential.densities import deformation
+from jaxclamp.potential.densities import deformation, half_gap
 from jaxclamp.potential.energy import State, at_points, gather, group_points
 from jaxclamp.potential.terms import INTIMA, Group
 
@@ -45,13 +46,13 @@ def length(e: Equilibria) -> Array:
 
 def overlap(e: Equilibria) -> Array:
     """How far opposite inner walls are past the plane between them, both together, mm."""
-    heights = [group.here(INTIMA).side * e.last.x[group.nodes, 1] for group in e.potential.of(INTIMA)]
-    return 2.0 * jnp.max(jnp.stack([jnp.max(-height) for height in heights]))
+    (group,) = e.potential.of(INTIMA)
+    return 2.0 * jnp.max(-half_gap(group_points(group, e.last.x), group.here(INTIMA)))
 
 
 def carried(e: Equilibria) -> Array:
     """Share of the jaw's force that the inner walls press on each other with, beyond blood pressure."""
-    inner = e.marks.symmetry.parts_of_a_jaw * jnp.sum(between_walls(e.potential, e.last.x))
+    inner = e.marks.symmetry.parts_of_a_jaw * between_walls(e.potential, e.last.x)
     force = force_on_a_jaw(e)
     pressed = force > 0.0
     return jnp.where(pressed, inner / jnp.where(pressed, force, 1.0), 0.0)
@@ -73,24 +74,29 @@ def closed(e: Equilibria) -> Array:
 
 def contact_area(e: Equilibria) -> Array:
     """Area over which the inner wall presses on the opposite one, mm^2, smoothly counted."""
-    parts = [jnp.sum(_pressing(group, e.last)) for group in e.potential.of(INTIMA)]
-    return e.marks.symmetry.parts_of_a_jaw * total(parts)
+    (group,) = e.potential.of(INTIMA)
+    return e.marks.symmetry.parts_of_a_jaw * jnp.sum(_pressing(group, e.last))
 
 
 def _pressing(group: Group, state: State) -> Array:
-    """Current area of the points of an inner wall in contact, mm^2, (n_q, n_facets).
+    """Current area of the points of the inner walls in contact, mm^2, (n_q, n_facets).
 
     In part where they press less than at the end of the law's smooth onset.
     """
     here, nodes = group.here(INTIMA), gather(state.x, group.nodes)
-    y = at_points(here.rule.dN, nodes)
-    first, second = ([y[c, i] for i in range(3)] for c in range(2))
-    da = norm(cross(first, second)) * jnp.asarray(here.rule.weights)[:, None]
-    height = here.side * (group_points(group, state.x)[0, 1] - here.plane)
+    da = total(_areas(here.rule, wall) for wall in jnp.split(nodes, 2 if here.both else 1))
+    height = half_gap(group_points(group, state.x), here)
     pressure = -jax.grad(lambda gap: jnp.sum(here.contact.intima_energy(gap)))(height)
     onset = here.contact.intima_stiffness * here.contact.intima_onset
     share = jnp.clip(pressure / onset, 0.0, 1.0)
     return da * share**2 * (3.0 - 2.0 * share)
+
+
+def _areas(rule: FacetRule, nodes: Array) -> Array:
+    """Current area of the points of facets, mm^2, (n_q, n_facets); nodes: (n_fn, 3, n_facets)."""
+    y = at_points(rule.dN, nodes)
+    first, second = ([y[c, i] for i in range(3)] for c in range(2))
+    return norm(cross(first, second)) * jnp.asarray(rule.weights)[:, None]
 
 
 def fold_stretch_ratio(e: Equilibria) -> Array:

@@ -28,12 +28,14 @@ from jaxclamp.observe.measures import (
     stress_at_P,
     travel_of_a_jaw,
 )
-from jaxclamp.observe.stresses import gaps, noise
+from jaxclamp.observe.stresses import gaps, node_gaps, noise
 from jaxclamp.potential.energy import gather
 from jaxclamp.potential.terms import JAWS
 
 Read = Callable[[Equilibria], Any]
 
+NODES_SUNK = "node_penetration_mm"
+"""key of a figure that is looked at and not reported"""
 J_OFF = 0.05
 """a wall keeps its volume; a point whose J is further from 1 is not resolved"""
 
@@ -114,6 +116,11 @@ def _penetration(e: Equilibria) -> Array:
     return jnp.maximum(jnp.max(jnp.stack(deepest)), 0.0)
 
 
+def _penetration_of_nodes(e: Equilibria) -> Array:
+    deepest = [jnp.max(-node_gaps(group, e.last)) for group in e.potential.of(JAWS)]
+    return jnp.maximum(jnp.max(jnp.stack(deepest)), 0.0)
+
+
 # --- stress -----------------------------------------------------------------------------------------
 
 
@@ -156,7 +163,7 @@ FIGURES = (
     Figure(
         "jaw_travel_mm", "travel of each jaw", _travel, order=WHOLE, shown=("summary", "numbers", "study")
     ),
-    Figure("jaw_height_mm", "height of the jaw above the axis", lambda e: e.last.jaw_height, contract=False),
+    Figure(NODES_SUNK, "deepest node of the wall inside a jaw", _penetration_of_nodes, contract=False),
     Figure("lumen_height_mm", "lumen height", _height, order=WHOLE, shown=("summary", "numbers")),
     Figure(
         "lumen_width_mm",

@@ -121,6 +121,12 @@ def gaps(group: Group, state: State) -> Array:
     return jaw_gap([y[0, i] for i in range(3)], state.q, group.here(JAWS))
 
 
+def node_gaps(group: Group, state: State) -> Array:
+    """Gap of the nodes of a group of jaw contact, mm, (n_fn, n_facets)."""
+    y = gather(state.x, group.nodes)
+    return jaw_gap([y[:, i] for i in range(3)], state.q, group.here(JAWS))
+
+
 def facet_contact(group: Group, state: State) -> tuple[Array, Array]:
     """Contact pressure on the deformed outer wall, kPa, and current area of the points, mm^2."""
     here = group.here(JAWS)

@@ -1,9 +1,9 @@
 """Rigid jaws as gap functions. A jaw sees one point; it has no mesh.
 
-Jaw coordinates: the origin is the jaw's lowest point above mid-length, x runs across the artery,
-y up into the jaw, z along the artery. `gap(point)` is the signed distance, positive outside: zero
+Jaw coordinates: the origin is the lowest point of the jaw's smooth face above mid-length, x runs across the
+artery, y up into the jaw, z along the artery. `gap(point)` is the signed distance, positive outside: zero
 on the face and exact to first order around it (within 0.3 % in the short blends between the parts
-of a face), with continuous second derivative.
+of a face), with continuous second derivative. Faces that ship can have relief: teeth and a crown.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from jax import Array
 
 from jaxclamp.core.records import quantity, record, static
 from jaxclamp.core.tensors import Vector, half_square, norm, ramp
+from jaxclamp.physics.relief import Crown, Relief, Teeth, with_relief
 
 
 class Jaw(abc.ABC):
@@ -41,26 +42,56 @@ class Jaw(abc.ABC):
         return 1.0 / jnp.maximum(jnp.max(self.curvatures()), 1e-12)
 
 
+class Face(Jaw):
+    """A jaw with a smooth face that is the same all across the artery, and perhaps relief on it."""
+
+    teeth: Teeth | None
+    """on the face"""
+    crown: Crown | None
+    """of the face across the artery"""
+
+    @abc.abstractmethod
+    def smooth_gap(self, point: Vector) -> Array:
+        """Gap of the face without relief, mm."""
+
+    @abc.abstractmethod
+    def smooth_curvatures(self) -> Array:
+        """Greatest curvatures of the face without relief, 1/mm, (n_parts,)."""
+
+    @property
+    def relief(self) -> list[Relief]:
+        """What there is on the face."""
+        return [part for part in (self.teeth, self.crown) if part is not None]
+
+    def gap(self, point: Vector) -> Array:
+        return with_relief(self.smooth_gap, self.relief, point)
+
+    def curvatures(self) -> Array:
+        return jnp.concatenate([self.smooth_curvatures(), *(part.curvatures() for part in self.relief)])
+
+
 @record
-class Cylinder(Jaw):
+class Cylinder(Face):
     """A round bar across the artery."""
 
     shape: str = static("cylinder")
     radius: Array = quantity("mm", 0.0, 1e4, open_lower=True)
     """radius of the bar"""
+    teeth: Teeth | None = None
+    crown: Crown | None = None
 
-    def gap(self, point: Vector) -> Array:
+    def smooth_gap(self, point: Vector) -> Array:
         return norm((point[1] - self.radius, point[2])) - self.radius
 
     def half_extent(self) -> Array:
         return jnp.asarray(self.radius)
 
-    def curvatures(self) -> Array:
+    def smooth_curvatures(self) -> Array:
         return jnp.reshape(1.0 / self.radius, 1)
 
 
 @record
-class Flat(Jaw):
+class Flat(Face):
     """A flat face with rounded edges."""
 
     shape: str = static("flat")
@@ -68,19 +99,21 @@ class Flat(Jaw):
     """half the width of the flat part, along the artery; the edges come on top"""
     edge_radius: Array = quantity("mm", 0.0, 1e3, open_lower=True)
     """radius of the rounding from the flat part to the side"""
+    teeth: Teeth | None = None
+    crown: Crown | None = None
 
-    def gap(self, point: Vector) -> Array:
+    def smooth_gap(self, point: Vector) -> Array:
         return _rounded(jnp.abs(point[2]) - self.half_width, point[1], self.half_width, self.edge_radius)
 
     def half_extent(self) -> Array:
         return jnp.asarray(self.half_width + self.edge_radius)
 
-    def curvatures(self) -> Array:
+    def smooth_curvatures(self) -> Array:
         return jnp.reshape(1.0 / self.edge_radius, 1)
 
 
 @record
-class Spline(Jaw):
+class Spline(Face):
     """A smooth profile y = h(z), symmetric about the middle, with rounded edges.
 
     The slope h' is the quadratic B-spline over equally spaced stations z_i = i d, i = 0..n, with
@@ -99,6 +132,8 @@ class Spline(Jaw):
     """control values of h' at the stations beside the middle; the last is the slope at the end, (n,)"""
     edge_radius: Array = quantity("mm", 0.0, 1e3, open_lower=True)
     """radius of the rounding from the profile's end to the side"""
+    teeth: Teeth | None = None
+    crown: Crown | None = None
 
     def _control(self) -> Array:
         """Control values of h' at all stations, (n + 1,)."""
@@ -123,7 +158,7 @@ class Spline(Jaw):
         slope = control[1] * t + jnp.sum(kinks * jnp.where(u < 0.5, v * v / 2.0, u), axis=0)
         return spacing * height, slope
 
-    def gap(self, point: Vector) -> Array:
+    def smooth_gap(self, point: Vector) -> Array:
         y, z = point[1], jnp.abs(point[2])
         h, slope = self.height(z)
         end_h, end_slope = self.height(jnp.asarray(self.half_width))
@@ -134,7 +169,7 @@ class Spline(Jaw):
     def half_extent(self) -> Array:
         return jnp.asarray(self.half_width + self.edge_radius)
 
-    def curvatures(self) -> Array:
+    def smooth_curvatures(self) -> Array:
         bends = jnp.diff(self._control()) / self._spacing()
         return jnp.append(bends, 1.0 / self.edge_radius)
 

@@ -16,23 +16,25 @@ import numpy as np
 from jax import Array
 
 from jaxclamp.core.records import record, static
-from jaxclamp.core.tensors import Tensor, Vector, cross, det, product, transpose
+from jaxclamp.core.tensors import Tensor, Vector, cross, det, norm, product, total, transpose
 from jaxclamp.fem.stencils import FacetRule
 from jaxclamp.physics.contact import Contact
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.physics.materials import Material
+from jaxclamp.physics.placement import Placement
 
 Rigid = Sequence[Array] | Array
 Density = Callable[[Tensor, Rigid, Any], Array]
 
-RIGID = ("jaw_height",)
-"""rigid coordinates q: the height of the upper jaw's lowest point above the artery's axis, mm; where both
-jaws are modelled, the lower one is its mirror image"""
+RIGID = ("jaw_height", "clamp_height")
+"""rigid coordinates q, mm: how high the upper jaw's lowest line is above the clamp's middle, and the lower
+one's below it; and, where both jaws are modelled, how high that middle is above the artery's axis: no force but
+the jaws' acts on the clamp, so that both press alike"""
 
 
-def rigid(height: float) -> Array:
-    """Rigid coordinates, (n_q,), mm, all at one height."""
-    return jax.device_put(np.full(len(RIGID), float(height)))
+def rigid(height: float, n_rigid: int = 1) -> Array:
+    """Rigid coordinates, (n_q,), mm, of jaws at a height in a clamp whose middle is on the axis."""
+    return jax.device_put(height * np.eye(1, n_rigid)[0])
 
 
 @record
@@ -98,6 +100,8 @@ class Touch:
 
     jaw: Jaw
     """its shape"""
+    placement: Placement
+    """how it lies across the artery and closes"""
     contact: Contact
     """its law"""
     dA: Array
@@ -105,12 +109,13 @@ class Touch:
     rule: FacetRule
     """where the points of a facet are"""
     side: int = static(default=1)
-    """1: the upper jaw, -1: the lower one, its mirror image in y = 0"""
+    """1: the upper jaw, -1: the lower one, seen in its mirror image in the clamp's middle"""
 
 
 def jaw_gap(x: Vector, q: Rigid, here: Touch) -> Array:
     """Distance of points x (components first) from the jaw, mm, positive where open."""
-    return here.jaw.gap((x[0], here.side * x[1] - q[0], x[2]))
+    above = here.side * (x[1] - q[1]) if len(q) > 1 else here.side * x[1]
+    return here.placement.gap(here.jaw, (x[0], above, x[2]), q[0])
 
 
 def jaw_energy(y: Tensor, q: Rigid, here: Touch) -> Array:
@@ -125,24 +130,40 @@ def contact_pressure(gap: Array, here: Touch) -> Array:
 
 @record
 class Meeting:
-    """Contact of the inner wall with the opposite one, in the plane between them."""
+    """Contact of the upper inner wall with the opposite one."""
 
     contact: Contact
     """its law"""
     dA: Array
-    """stress-free area of a point of the lumen's surface, mm^2, (n_q, n_facets)"""
+    """stress-free area of a point of one wall, mm^2, (n_q, n_facets)"""
     rule: FacetRule
     """where the points of a facet are"""
     plane: Array
-    """height of the plane, mm"""
-    side: int = static(default=1)
-    """1: the upper wall, which stays above the plane, -1: the lower one"""
+    """how far towards each wall the middle is moved, mm: 0, or for a derivative"""
+    both: bool = static(default=False)
+    """both walls are modelled; else the lower one is the mirror image of the upper one in y = 0"""
+
+
+def half_gap(y: Tensor, here: Meeting) -> Array:
+    """Half the gap between opposite inner walls, mm; y: position, or place and tangents of both walls.
+
+    A point of the upper wall faces that of the lower one which was its mirror image in the open artery, and
+    the gap is their distance along the mean normal of both walls there: where both are mirror images still,
+    twice the height above the plane y = 0. A point that has slipped along the wall by s is judged by s^2
+    times the wall's curvature too far or too near.
+    """
+    if not here.both:
+        return y[0, 1] - here.plane
+    upper, lower = (cross([y[c, i] for i in range(3)], [y[c + 1, i] for i in range(3)]) for c in (1, 4))
+    up = [a + b for a, b in zip(upper, lower, strict=True)]
+    apart = total((y[0, i] - y[3, i]) * up[i] for i in range(3)) / norm(up)
+    return 0.5 * apart - here.plane
 
 
 def intima_energy(y: Tensor, q: Rigid, here: Meeting) -> Array:
-    """Contact energy of the lumen's surface against its mirror image; y: position.
+    """Contact energy of opposite inner walls.
 
-    By symmetry the opposite walls meet in a plane (y = 0). Contact sets in where the wall crosses it: beside
-    the fold the open wall comes arbitrarily close.
+    Contact sets in where they cross: beside the fold the open wall comes arbitrarily close.
     """
-    return here.contact.intima_energy(here.side * (y[0, 1] - here.plane)) * here.dA
+    walls = 2.0 if here.both else 1.0
+    return walls * here.contact.intima_energy(half_gap(y, here)) * here.dA

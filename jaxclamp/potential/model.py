@@ -16,7 +16,7 @@ from jaxclamp.fem.grid import Mesh
 from jaxclamp.fem.landmarks import Landmarks, find_landmarks
 from jaxclamp.fem.pattern import FACETS_PER_BLOCK, Layout, Pattern, Region, block_size, build_pattern
 from jaxclamp.fem.stencils import Stencils, build_stencils
-from jaxclamp.fem.symmetry import Symmetry, symmetry_of
+from jaxclamp.fem.symmetry import Symmetry
 from jaxclamp.fem.tube import build_tube, end_height, end_lines, supports
 from jaxclamp.physics.contact import Contact
 from jaxclamp.potential.bodies import tube_body
@@ -91,16 +91,21 @@ class Model:
 def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
     """Mesh, sparse pattern and landmarks of a scene's static choices."""
     forget_if_crowded()  # another mesh brings other programs
-    mesh = build_tube(scene.mesh)
+    mesh = build_tube(scene.mesh, scene.clamp)
     stencils = build_stencils(mesh.element, scene.mesh.contact_points)
-    sides = _sides(mesh, scene.mesh)
+    symmetry, sides = Symmetry(mesh.planes), _sides(mesh, scene.mesh)
     size = block_size(len(stencils.weights))
     nodes = {f"layer {i}": (mesh.cells[:, slice(*span)], size) for i, span in enumerate(mesh.layer_cells)}
     nodes["lumen"] = (mesh.inner_facets, FACETS_PER_BLOCK)
     for name, facets in sides.items():
-        nodes[f"{name} inside"] = (mesh.inner_facets[:, facets], FACETS_PER_BLOCK)
         nodes[f"{name} outside"] = (mesh.outer_facets[:, facets], FACETS_PER_BLOCK)
-    layout, regions, pattern = build_pattern(supports(mesh, scene.mesh), nodes)
+    meeting = mesh.inner_facets[:, sides["upper"]]
+    if "lower" in sides:  # opposite walls, node by node: the lower facets' run the other way round
+        order = mesh.element.order
+        mirrored = np.flip(np.arange((order + 1) ** 2).reshape(order + 1, order + 1), axis=0).ravel()
+        meeting = np.concatenate([meeting, mesh.inner_facets[mirrored][:, sides["lower"]]])
+    nodes["upper inside"] = (meeting, FACETS_PER_BLOCK)
+    layout, regions, pattern = build_pattern(supports(mesh, scene.mesh), nodes, symmetry.rigid_coordinates)
     marks = find_landmarks(mesh, scene.mesh, tuple(layer.name for layer in scene.artery.layers))
     layout, regions = jax.device_put((layout, regions))
     return Discretisation(
@@ -109,13 +114,15 @@ def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
 
 
 def _sides(mesh: Mesh, settings: MeshSettings) -> dict[str, np.ndarray]:
-    """Facets of the upper half and, where it is modelled, of the lower one."""
-    first, last = symmetry_of(settings.symmetry).quarters
+    """Facets of the upper half and, where it is modelled, their mirror images in the lower one."""
+    first, last = Symmetry(mesh.planes).quarters
     quarter = first + np.arange((last - first) * settings.circumferential) // settings.circumferential
-    around = np.tile(quarter, mesh.inner_facets.shape[1] // len(quarter))
-    upper = np.isin(around, (0, 1))
-    found = {"upper": np.flatnonzero(upper), "lower": np.flatnonzero(~upper)}
-    return {name: facets for name, facets in found.items() if len(facets)}
+    facets = np.arange(mesh.inner_facets.shape[1]).reshape(-1, len(quarter))
+    upper = np.isin(quarter, (0, 1))
+    found = {"upper": facets[:, upper].ravel()}
+    if not np.all(upper):  # the fold is in the middle of the quarters, or where they close
+        found["lower"] = facets[:, ::-1][:, upper].ravel()
+    return found
 
 
 def potential_of(scene: Scene, discretisation: Discretisation) -> Potential:
@@ -132,7 +139,7 @@ def _terms(
     artery: Artery, clamp: Clamp, contact: Contact, settings: MeshSettings, d: Discretisation
 ) -> tuple[Term | Volume, ...]:
     body = tube_body(d.mesh, d.stencils, settings, artery)
-    return all_terms(Made(artery, clamp, contact, body, d.stencils, d.sides))
+    return all_terms(Made(artery, clamp, contact, settings, body, d.stencils, d.sides))
 
 
 Terms = Callable[[Artery, Clamp, Contact, MeshSettings, Discretisation], tuple[Term | Volume, ...]]
@@ -146,7 +153,7 @@ def positions(scene: Scene, discretisation: Discretisation, free: Array) -> Arra
     mesh, layout = discretisation.mesh, discretisation.layout
     end = end_height(scene.artery, scene.artery.axial_stretch)
     held = jnp.zeros((layout.n_nodes, 3))
-    for line in end_lines(scene.mesh):
+    for line in end_lines(mesh):
         held = held.at[mesh.plane(2, line), 2].set(end if line == -1 else -end)
     return held.ravel().at[layout.free].set(free).reshape(layout.n_nodes, 3)
 

@@ -20,7 +20,7 @@ from jax import Array
 from jaxclamp.core.records import record, static
 from jaxclamp.core.tensors import Tensor, components, det, pointwise_derivatives, stacked, total
 from jaxclamp.fem.pattern import PAIRS, Layout, Pattern
-from jaxclamp.potential.densities import RIGID, Density, Solid, dilatation
+from jaxclamp.potential.densities import Density, Solid, dilatation
 from jaxclamp.potential.energy import (
     AnyArray,
     State,
@@ -312,7 +312,7 @@ def linearise(potential: Potential, state: State, pattern: Pattern) -> Linearisa
 
 def assemble(potential: Potential, pattern: Pattern, pieces: list[list[Any]]) -> Linearisation:
     """Pieces summed into residual and tangent, on the host: a sum is no program to compile."""
-    layout, n_q = potential.layout, len(RIGID)
+    layout, n_q = potential.layout, potential.layout.n_rigid
     free = np.asarray(layout.free)
     values = np.zeros(len(pattern.indices))
     wall, missing, loads = np.zeros((3, layout.n_nodes, 3))

@@ -3,7 +3,7 @@
     Pi(x, p; q) = sum_cells int [psi_bar(F) + p (J - 1)] dV - 1/2 p' M p      wall, incompressibility
                   - pressure * V_lumen(x)                                     blood pressure
                   + int phi(gap(x; q)) dA                                     jaw contact
-                  + int phi(y + smoothing) dA                                 intima contact
+                  + int phi(gap between the walls) dA                         intima contact
 
 of the modelled part, with one, two or four pressures p per cell and M = int N_m N_n / bulk dV, so that at
 equilibrium p = bulk (J - 1) averaged over the cell (mean dilatation, Q1/P0) or projected on the linear
@@ -27,7 +27,9 @@ from jax import Array
 from jaxclamp.core.records import record, static
 from jaxclamp.fem.pattern import Layout, Region
 from jaxclamp.fem.stencils import Stencils
+from jaxclamp.fem.tube import closed_radii
 from jaxclamp.physics.contact import Contact
+from jaxclamp.physics.placement import Placement
 from jaxclamp.potential.bodies import Body, facet_areas, pressure_stiffness, solids
 from jaxclamp.potential.densities import (
     Blood,
@@ -39,7 +41,7 @@ from jaxclamp.potential.densities import (
     jaw_energy,
     shape_energy,
 )
-from jaxclamp.scenes.scene import Artery, Clamp, Scene
+from jaxclamp.scenes.scene import Artery, Clamp, MeshSettings, Scene
 
 
 @record
@@ -228,12 +230,15 @@ class Made:
     """of the scene"""
     contact: Contact
     """of the scene"""
+    settings: MeshSettings
+    """of the scene"""
     body: Body
     """the wall"""
     stencils: Stencils
     """of its element"""
     sides: dict[str, np.ndarray]
-    """facets of each half of the circumference that is modelled, by its name in `SIDES`"""
+    """facets of each half of the circumference that is modelled, by its name in `SIDES`; a facet stands where
+    its mirror image stands in the other"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -289,33 +294,53 @@ def _blood(made: Made) -> Iterator[Term]:
 
 
 def _jaw_reasons(scene: Scene) -> dict[str, str]:
-    return {JAWS: f"rigid '{scene.clamp.jaw.shape}' jaw against the outer wall, frictionless"}
+    shapes = " and ".join(f"'{jaw.shape}'" for jaw in scene.clamp.kinds.values())
+    jaws = "jaw" if len(scene.clamp.kinds) == 1 else "jaws"
+    return {JAWS: f"rigid {shapes} {jaws} against the outer wall, frictionless"}
 
 
 def _jaws(made: Made) -> Iterator[Term]:
     areas = facet_areas(made.body, made.stencils.contact, outer=True)
+    placement, jaws = _placement(made), dict(zip(SIDES, made.clamp.jaws, strict=True))
     for name, facets in made.sides.items():
-        dA = _some(areas, facets)
-        rule = made.stencils.contact
-        here = Touch(jaw=made.clamp.jaw, contact=made.contact, dA=dA, rule=rule, side=SIDES[name])
+        here = Touch(
+            jaw=jaws[name],
+            placement=placement,
+            contact=made.contact,
+            dA=_some(areas, facets),
+            rule=made.stencils.contact,
+            side=SIDES[name],
+        )
         yield Term(
             name=JAWS, region=f"{name} outside", stencil="contact", density=jaw_energy, here=here, moved=True
         )
 
 
+def _placement(made: Made) -> Placement:
+    """Where the jaws come from: the reach counts from the side of the closed artery without load."""
+    clamp, tip = made.clamp, None
+    if clamp.reach is not None:
+        tip = clamp.reach - closed_radii(made.body.mesh, made.settings, made.artery)[-1]
+    hinge = None if clamp.closing is None else clamp.closing.hinge_distance
+    return Placement(oblique=clamp.oblique, hinge_distance=hinge, tip=tip, reach=clamp.reach)
+
+
 def _intima_reasons(scene: Scene) -> dict[str, str]:
     if scene.stop.far_from_closure():
         return {}
-    return {INTIMA: "opposite inner walls meet in the plane of symmetry once the lumen closes"}
+    where = " in the plane of symmetry" if "y" in scene.clamp.planes else ""
+    return {INTIMA: f"opposite inner walls meet{where} once the lumen closes"}
 
 
 def _intima(made: Made) -> Iterator[Term]:
-    areas = facet_areas(made.body, made.stencils.meeting, outer=False)
-    for name, facets in made.sides.items():
-        dA = _some(areas, facets)
-        rule, plane = made.stencils.meeting, jnp.zeros(())
-        here = Meeting(contact=made.contact, dA=dA, rule=rule, plane=plane, side=SIDES[name])
-        yield Term(name=INTIMA, region=f"{name} inside", stencil="meeting", density=intima_energy, here=here)
+    areas, both = facet_areas(made.body, made.stencils.meeting, outer=False), "lower" in made.sides
+    dA = _some(areas, made.sides["upper"])
+    if both:  # a stress-free artery is its own mirror image
+        dA = 0.5 * (dA + _some(areas, made.sides["lower"]))
+    rule = made.stencils.meeting
+    here = Meeting(contact=made.contact, dA=dA, rule=rule, plane=jnp.zeros(()), both=both)
+    stencil = "meeting of both" if both else "meeting"
+    yield Term(name=INTIMA, region="upper inside", stencil=stencil, density=intima_energy, here=here)
 
 
 def _some(areas: Array, facets: np.ndarray) -> Array:
@@ -360,6 +385,7 @@ def build_potential(
         "lumen": stencils.lumen.surface,
         "contact": stencils.contact.position,
         "meeting": stencils.meeting.position,
+        "meeting of both": stencils.meeting.of_two,
     }
     together: dict[tuple[str, str], list[Term | Volume]] = {}
     for term in terms:

@@ -133,6 +133,8 @@ def _check(found: _Found, value: Any) -> None:
     hint = hints_of(type(owner)).get(field.name)
     key = text((*found.steps[:last], file_key(field), *found.steps[last + 1 :]))
     whole = last == len(found.steps) - 1
+    if value is None and field.default is None:
+        return
     if "range" in field.metadata:
         numbers(value, field.metadata["range"], key)
     elif whole or field.metadata.get("static"):  # an item of a list of whole numbers is seen as a list
@@ -153,6 +155,8 @@ def describe(scene: Any, address: str) -> Place:
             f"{_said(address)} is a choice or a part of the scene: expected a number of the scene, such as "
             "clamp.jaw.radius_mm"
         )
+    if found.value is None:
+        raise BadAddress(f"{_said(address)} is not there in this scene: give it a value first")
     last = max(i for i, step in enumerate(found.steps) if isinstance(step, str))
     keyed = (*found.steps[:last], file_key(found.field), *found.steps[last + 1 :])
     return Place(text(found.steps), text(keyed), found.value, found.field.metadata["range"])

@@ -12,7 +12,8 @@ import numpy as np
 
 from jaxclamp.core.failures import BadKey
 from jaxclamp.core.records import UNIT_FACTOR
-from jaxclamp.physics.jaws import Spline
+from jaxclamp.physics.jaws import Face, Spline
+from jaxclamp.physics.relief import Teeth
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.scene import Artery, Layer, Scene
 from jaxclamp.scenes.schema import refuse
@@ -37,6 +38,14 @@ LENGTHS = (0.1, 1e4)
 """the artery's length over the widest outer radius"""
 JAW_SIZES = (1e-3, 1e4)
 """a jaw's lengths over the widest outer radius"""
+HINGE = 1.2
+"""least distance of a hinge over the widest outer radius: beside the artery, which widens in the body"""
+LEAST_REACH = 0.02
+"""least reach of a jaw over the widest outer radius"""
+MOST_ROWS = 9
+"""ridges of a jaw"""
+LEAST_POINTS = 4
+"""contact points over the pitch of teeth, with fewer of which teeth are not what is computed"""
 SMOOTHINGS = (1e-6, 1.0)
 """the smoothing of contact over the thickness of the wall"""
 
@@ -45,10 +54,11 @@ def check(scene: Scene) -> None:
     """Raise BadKey for the first thing that is impossible."""
     check_laws(scene.artery)
     checks = (
+        check_clamp,
         check_names,
         check_proportions,
         check_closing,
-        check_jaw,
+        check_jaws,
         check_mesh,
         check_stop,
         check_solver,
@@ -85,15 +95,20 @@ def check_names(scene: Scene) -> None:
 
 def check_proportions(scene: Scene) -> None:
     """Lengths are in proportion to each other."""
-    layers, jaw = scene.artery.layers, scene.clamp.jaw
+    layers = scene.artery.layers
     for i, layer in enumerate(layers):
         path = f"artery.layers[{i}]"
         inner = f"{path}.inner_radius_mm", layer.inner_radius
         _check_ratio(f"{path}.thickness_mm", layer.thickness, THICKNESSES, inner)
     _check_ratio("artery.length_mm", scene.artery.length, LENGTHS, _widest(scene))
-    for key, field in schema.fields_by_key(type(jaw)).items():
-        if "range" in field.metadata and field.metadata["range"].unit == "mm" and not field.metadata["many"]:
-            _check_ratio(f"clamp.jaw.{key}", getattr(jaw, field.name), JAW_SIZES, _widest(scene))
+    for name, jaw in scene.clamp.kinds.items():
+        for key, field in schema.fields_by_key(type(jaw)).items():
+            if (
+                "range" in field.metadata
+                and field.metadata["range"].unit == "mm"
+                and not field.metadata["many"]
+            ):
+                _check_ratio(f"clamp.{name}.{key}", getattr(jaw, field.name), JAW_SIZES, _widest(scene))
     wall = "the thickness of the wall", sum(float(layer.thickness) for layer in layers)
     _check_ratio("contact.smoothing_mm", scene.contact.smoothing, SMOOTHINGS, wall)
 
@@ -169,18 +184,93 @@ def check_stop(scene: Scene) -> None:
             _check_ratio(f"stop.{key}", getattr(scene.stop, field.name), TRAVELS, _widest(scene))
 
 
-def check_jaw(scene: Scene) -> None:
-    """The middle of the jaw is its lowest point, as travel and first contact assume."""
-    jaw = scene.clamp.jaw
-    if isinstance(jaw, Spline):
-        height = np.asarray(jaw.height(np.linspace(0.0, float(jaw.half_width), 200))[0])
-        if np.min(height) < -1e-9 * float(jaw.half_width):
+def check_clamp(scene: Scene) -> None:
+    """There is one jaw for both, or an upper and a lower one; and the jaws get across the artery."""
+    clamp = scene.clamp
+    found = [name for name in ("jaw", "upper", "lower") if getattr(clamp, name) is not None]
+    if found not in (["jaw"], ["upper", "lower"]):
+        raise refuse(
+            "clamp", f"with {' and '.join(found) or 'no jaw'}", "either jaw, or both upper and lower"
+        )
+    if clamp.closing is not None:
+        radius = _widest(scene)[1]
+        least, distance = HINGE * radius, float(clamp.closing.hinge_distance)
+        if distance < least:
             raise refuse(
-                "clamp.jaw.slopes",
-                np.asarray(jaw.slopes).tolist(),
-                "slopes that keep the middle the lowest point of the jaw; "
-                f"here it lies {-np.min(height):.3g} mm above the lowest",
+                "clamp.closing.hinge_distance_mm",
+                distance,
+                f"at least {least:.3g} mm, a hinge beside the artery of {radius:.3g} mm outer radius",
             )
+    if clamp.reach is not None and float(clamp.reach) < LEAST_REACH * _widest(scene)[1]:
+        raise refuse(
+            "clamp.reach_mm",
+            float(clamp.reach),
+            f"at least {LEAST_REACH * _widest(scene)[1]:.3g} mm, so that the jaws reach the artery",
+        )
+    if not set(_asked_for(scene)) <= set(clamp.planes):
+        holds = ", ".join(f"{axis} = 0" for axis in clamp.planes) or "none"
+        raise refuse("mesh.symmetry", scene.mesh.symmetry, f"auto, or planes that the clamp has ({holds})")
+
+
+def _asked_for(scene: Scene) -> str:
+    return {"auto": "", "none": ""}.get(scene.mesh.symmetry, scene.mesh.symmetry)
+
+
+def check_jaws(scene: Scene) -> None:
+    """The middle of a jaw is its lowest point, as travel and first contact assume; its teeth can be made."""
+    for name, jaw in scene.clamp.kinds.items():
+        if isinstance(jaw, Spline):
+            height = np.asarray(jaw.height(np.linspace(0.0, float(jaw.half_width), 200))[0])
+            if np.min(height) < -1e-9 * float(jaw.half_width):
+                raise refuse(
+                    f"clamp.{name}.slopes",
+                    np.asarray(jaw.slopes).tolist(),
+                    "slopes that keep the middle the lowest point of the jaw; "
+                    f"here it lies {-np.min(height):.3g} mm above the lowest",
+                )
+        if isinstance(jaw, Face) and jaw.teeth is not None:
+            check_teeth(jaw, jaw.teeth, f"clamp.{name}.teeth", scene)
+
+
+def check_teeth(jaw: Face, teeth: Teeth, path: str, scene: Scene) -> None:
+    """Teeth are no deeper than the jaw's edge and than they are wide, and contact can see them."""
+    depth, pitch = float(teeth.depth), float(teeth.pitch)
+    edge = 1.0 / float(np.max(np.asarray(jaw.smooth_curvatures())))
+    if depth > edge:
+        raise refuse(
+            f"{path}.depth_mm", depth, f"at most {edge:.3g} mm, the least radius of the face and its edges"
+        )
+    if depth > pitch:
+        raise refuse(f"{path}.depth_mm", depth, f"at most the pitch, {pitch:.3g} mm")
+    if teeth.tip_radius is not None:
+        if teeth.profile != "wedge":
+            raise refuse(f"{path}.tip_radius_mm", float(teeth.tip_radius), 'profile = "wedge" with it')
+        if depth > 0.0 and not float(teeth.tip_radius) < float(teeth.sine_radius()):
+            raise refuse(
+                f"{path}.tip_radius_mm",
+                float(teeth.tip_radius),
+                f"less than the {float(teeth.sine_radius()):.3g} mm of a sine of this pitch and depth",
+            )
+    if teeth.profile == "rows" and not 1 <= teeth.rows <= MOST_ROWS:
+        raise refuse(f"{path}.rows", teeth.rows, f"a whole number from 1 to {MOST_ROWS}")
+    if depth > 0.0 and (apart := points_apart(scene, teeth)) > pitch / LEAST_POINTS:
+        raise refuse(
+            f"{path}.pitch_mm",
+            pitch,
+            f"at least {LEAST_POINTS * apart:.3g} mm, so that {LEAST_POINTS} contact points see a tooth "
+            "(or more elements, or mesh.contact_points)",
+        )
+
+
+def points_apart(scene: Scene, teeth: Teeth) -> float:
+    """Mean distance of contact points under the jaws in the directions in which teeth change, about, mm."""
+    mesh, artery = scene.mesh, scene.artery
+    g, order = float(mesh.axial_grading), 1 + (mesh.element == "q2p1")
+    first = 1.0 / mesh.axial if g < 1e-6 else np.expm1(g / mesh.axial) / np.expm1(g)
+    along = 0.5 * float(artery.length * artery.axial_stretch) * first
+    across = 0.5 * np.pi * _widest(scene)[1] / mesh.circumferential
+    sizes = {"along": [along], "across": [across], "both": [along, across]}[teeth.direction]
+    return max(sizes) / max(mesh.contact_points, order)
 
 
 def check_solver(scene: Scene) -> None:

@@ -201,19 +201,13 @@ def _scene(table: dict[str, Any], fidelity: str) -> Scene:
 
 def _one_jaw(clamp: dict[str, Any]) -> dict[str, Any]:
     """`upper` and `lower` alike are one jaw."""
-    if "upper" not in clamp and "lower" not in clamp:
+    if "jaw" in clamp and "upper" not in clamp and "lower" not in clamp:
         return clamp
     others = {key: value for key, value in clamp.items() if key not in ("upper", "lower")}
     if "jaw" in clamp or "upper" not in clamp or "lower" not in clamp:
         raise refuse("clamp", clamp, "either jaw, or both upper and lower")
     upper, lower = (schema.table(schema.read(Jaw, clamp[key], f"clamp.{key}")) for key in ("upper", "lower"))
-    if upper != lower:
-        raise refuse(
-            "clamp.lower",
-            clamp["lower"],
-            "the same jaw as clamp.upper: two different jaws are not available yet",
-        )
-    return others | {"jaw": clamp["upper"]}
+    return others | {"jaw": clamp["upper"]} if upper == lower else clamp
 
 
 # --------------------------------------------------------------------------------- table to text

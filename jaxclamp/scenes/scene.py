@@ -51,11 +51,65 @@ class Artery:
 
 
 @record
-class Clamp:
-    """Two jaws alike, closing symmetrically across the artery."""
+class Hinge:
+    """Jaws that turn about a hinge beside the artery, as those of scissors."""
 
-    jaw: Jaw
+    hinge_distance: Array = quantity("mm", 0.0, 1e4, open_lower=True)
+    """from the artery's axis to the hinge"""
+
+
+@record
+class Clamp:
+    """Two jaws that close across the artery: `jaw` for both, or `upper` and `lower`.
+
+    A pair of unlike jaws floats as a whole in the closing direction, as a clamp in the hand does: both press
+    with one force. What is None is not there, and makes the model no larger.
+    """
+
+    jaw: Jaw | None = None
     """the shape of both"""
+    upper: Jaw | None = None
+    """the shape of the upper one"""
+    lower: Jaw | None = None
+    """the shape of the lower one, as it is seen in its mirror image"""
+    oblique: Array | None = quantity("deg", -80.0, 80.0, default=None)
+    """angle of both jaws about the closing direction"""
+    reach: Array | None = quantity("mm", 0.0, 1e3, open_lower=True, default=None)
+    """how far the jaws reach across, from the side of the artery without load; None: all the way"""
+    closing: Hinge | None = None
+    """None: the jaws stay parallel"""
+
+    @property
+    def jaws(self) -> tuple[Jaw, Jaw]:
+        """The upper and the lower one."""
+        upper, lower = (self.jaw, self.jaw) if self.jaw is not None else (self.upper, self.lower)
+        assert upper is not None
+        assert lower is not None
+        return upper, lower
+
+    @property
+    def kinds(self) -> dict[str, Jaw]:
+        """The jaws by the key of scene files: one, or two that are not alike."""
+        if self.jaw is not None:
+            return {"jaw": self.jaw}
+        return dict(zip(("upper", "lower"), self.jaws, strict=True))
+
+    def half_extent(self) -> float:
+        """Distance along the artery from the middle to the side of the wider jaw, mm."""
+        return max(float(jaw.half_extent()) for jaw in self.jaws)
+
+    @property
+    def planes(self) -> str:
+        """The mirror planes that hold, by the letters of their normals, whatever the floats."""
+        square = self.oblique is None
+        on_one_side = self.reach is not None or self.closing is not None
+        teeth = [part for jaw in self.jaws if (part := getattr(jaw, "teeth", None)) is not None]
+        holds = {
+            "x": square and not on_one_side and all("x" in part.planes for part in teeth),
+            "y": self.jaw is not None,
+            "z": square and all("z" in part.planes for part in teeth),
+        }
+        return "".join(axis for axis in "xyz" if holds[axis])
 
 
 class Stop(abc.ABC):

@@ -95,6 +95,12 @@ def _required_keys(cls: type) -> list[str]:
     return [key for key, field in fields_by_key(cls).items() if is_required(field, hints[field.name])]
 
 
+def present(hint: Any) -> Any:
+    """The type of what may be left out, of `X | None`: X; any other type as it is."""
+    kinds = [kind for kind in get_args(hint) if kind is not type(None)]
+    return kinds[0] if len(kinds) == 1 and type(None) in get_args(hint) else hint
+
+
 def tag_of(cls: type) -> tuple[str, str]:
     """Name and value of the tag of a record class; blank for one without."""
     return next(((f.name, str(f.default)) for f in dataclasses.fields(cls) if is_tag(f)), ("", ""))
@@ -189,7 +195,7 @@ def _read_record(cls: type, table: dict[str, Any], path: str, of: str = "") -> A
     values = {}
     for key, field in known.items():
         if key in table:
-            values[field.name] = _read_field(field, hints[field.name], table[key], join(path, key))
+            values[field.name] = _read_field(field, present(hints[field.name]), table[key], join(path, key))
         elif is_required(field, hints[field.name]):
             raise BadKey(f"{join(path, key)} is missing: expected {_wanted(field, hints)}")
         elif field.default is dataclasses.MISSING:
@@ -297,13 +303,15 @@ def _is_text(value: Any, field: dataclasses.Field[Any]) -> bool:
 
 
 def table(record: Any, path: str = "") -> dict[str, Any]:
-    """The table that `read` turns into an equal record: the tag first, then every key.
+    """The table that `read` turns into an equal record: the tag first, then every key that is there.
 
     path: where the record is, for refusals. Raises BadKey for an array where a file holds one number.
     """
     result: dict[str, Any] = {}
     for field in dataclasses.fields(record):
         value, key = getattr(record, field.name), file_key(field)
+        if value is None and field.default is None:
+            continue
         if is_tag(field):
             if _is_chosen_by_tag(type(record)):
                 result[key] = value

@@ -28,7 +28,7 @@ def check_values(record: Any, path: str = "", ranges: bool = True) -> None:
     for field in dataclasses.fields(record):
         value, name = getattr(record, field.name), schema.join(path, schema.file_key(field))
         check_value(field, hints.get(field.name), value, name, ranges)
-        if "range" in field.metadata and not isinstance(record, Material):
+        if "range" in field.metadata and value is not None and not isinstance(record, Material):
             _check_shape(value, field, name)
 
 
@@ -42,6 +42,9 @@ def hints_of(cls: type) -> dict[str, Any]:
 
 def check_value(field: dataclasses.Field[Any], hint: Any, value: Any, path: str, ranges: bool = True) -> None:
     """Raise BadKey unless a value may stand in a field of a record; hint: its type, None if not known."""
+    hint = schema.present(hint)
+    if value is None and field.default is None:
+        return
     if "range" in field.metadata:
         (check_quantity if ranges else numbers)(value, field.metadata["range"], path)
     elif field.metadata.get("static"):

@@ -32,7 +32,6 @@ from jax.custom_derivatives import SymbolicZero
 from jaxclamp.core.records import record
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measure import Measure, require_measure
-from jaxclamp.potential.densities import RIGID
 from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, discretise, positions, potential_of
 from jaxclamp.potential.terms import Potential
@@ -314,7 +313,7 @@ def see(scene: Scene, d: Discretisation, u: Unknowns) -> Equilibria:
         assert free is not None
         return settled(potential, positions(scene, d, free), q)
 
-    in_body = state(u.physiological, jnp.zeros(len(RIGID)))
+    in_body = state(u.physiological, jnp.zeros(d.layout.n_rigid))
     closed = () if u.stop is None or u.q is None else (state(u.stop, u.q),)
     return Equilibria(potential=potential, marks=d.marks, states=(in_body, *closed))
 
@@ -364,7 +363,7 @@ def _solve_in_worker(scene: Scene, d: Discretisation, to_stop: bool) -> tuple[Un
     """The solution of an abstract scene, by a callback to another process."""
     many: Any = jax.ShapeDtypeStruct(d.layout.free.shape, jnp.float64)
     one: Any = jax.ShapeDtypeStruct((), jnp.float64)
-    few: Any = jax.ShapeDtypeStruct((len(RIGID),), jnp.float64)
+    few: Any = jax.ShapeDtypeStruct((d.layout.n_rigid,), jnp.float64)
     u = Unknowns(physiological=many, stop=many if to_stop else None, q=few if to_stop else None)
 
     def call(leaves: Scene) -> tuple[Unknowns, np.ndarray]:

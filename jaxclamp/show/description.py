@@ -28,8 +28,9 @@ def describe(scene: Scene) -> dict[str, Any]:
 
     `symmetry` is the modelled share of the artery, `modelled` says it in words.
     """
-    symmetry, mesh, solver = symmetry_of(scene.mesh.symmetry), build_tube(scene.mesh), scene.solver
-    unknowns = unknowns_of(scene.mesh)
+    symmetry, mesh = symmetry_of(scene.mesh, scene.clamp), build_tube(scene.mesh, scene.clamp)
+    solver = scene.solver
+    unknowns = unknowns_of(scene)
     seconds = START_SECONDS + USUAL_ITERATIONS * ITERATION_SECONDS * unknowns**ITERATION_EXPONENT
     return {
         "symmetry": symmetry.share,
@@ -70,16 +71,17 @@ def _rounded(estimate: float) -> float:
 
 def warnings(scene: Scene) -> list[str]:
     """What the mesh cannot resolve, a sentence each."""
-    jaw, artery = scene.clamp.jaw, scene.artery
-    lines = np.asarray(axial_fractions(build_tube(scene.mesh), scene.mesh))
+    artery, said = scene.artery, []
+    lines = np.asarray(axial_fractions(build_tube(scene.mesh, scene.clamp), scene.mesh))
     heights = float(end_height(artery, 1.0)) * lines  # load-free, from one end or the middle to the other end
-    under = np.minimum(np.abs(heights[:-1]), np.abs(heights[1:])) <= float(jaw.half_extent())
-    widest = float(np.max(np.diff(heights)[under])) * float(artery.axial_stretch)
-    radius = float(jaw.least_radius())
-    if widest > radius:
-        return [
-            f"the jaw's least radius of curvature is {radius:.3g} mm, and the facets under it are up to "
-            f"{widest:.3g} mm long: stress at its edges is not resolved "
-            "(use more axial elements, or a larger radius)"
-        ]
-    return []
+    for name, jaw in scene.clamp.kinds.items():
+        under = np.minimum(np.abs(heights[:-1]), np.abs(heights[1:])) <= float(jaw.half_extent())
+        widest = float(np.max(np.diff(heights)[under])) * float(artery.axial_stretch)
+        radius, whose = float(jaw.least_radius()), {"jaw": "the jaw's"}.get(name, f"the {name} jaw's")
+        if widest > radius:
+            said.append(
+                f"{whose} least radius of curvature is {radius:.3g} mm, and the facets under it are up to "
+                f"{widest:.3g} mm long: stress at its edges is not resolved "
+                "(use more axial elements, or a larger radius)"
+            )
+    return said

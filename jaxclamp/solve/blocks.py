@@ -26,6 +26,7 @@ from jaxclamp.observe.stresses import cauchy_stress
 from jaxclamp.physics.contact import Contact
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.physics.materials import Material
+from jaxclamp.physics.placement import SQUARE
 from jaxclamp.potential.bodies import Body, brick_body, facet_areas
 from jaxclamp.potential.densities import Touch, jaw_energy, rigid
 from jaxclamp.potential.energy import State, energy, with_equilibrium_pressure
@@ -98,7 +99,7 @@ def brick(
     terms = list(wall_terms(body, stencils, [str(i) for i in range(len(layers))]))
     if jaw is not None:
         dA = facet_areas(body, stencils.contact, outer=True)
-        here = Touch(jaw=jaw[0], contact=jaw[1], dA=dA, rule=stencils.contact)
+        here = Touch(jaw=jaw[0], placement=SQUARE, contact=jaw[1], dA=dA, rule=stencils.contact)
         touch = {"name": JAWS, "region": "upper outside", "stencil": "contact"}
         terms.append(Term(density=jaw_energy, here=here, moved=True, **touch))
     potential = build_potential(terms, regions, stencils, layout)

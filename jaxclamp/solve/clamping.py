@@ -58,7 +58,7 @@ def inflate(scene: Scene, *, guess: Result | None = None) -> Result:
 def _solve(scene: Scene, guess: Result | None, tell: Tell, to_stop: bool) -> Result:
     start = time.perf_counter()
     require_computable(scene)
-    if (unknowns := unknowns_of(scene.mesh)) > (0 if guess is None else guess.model.pattern.n):
+    if (unknowns := unknowns_of(scene)) > (0 if guess is None else guess.model.pattern.n):
         # a guess of as many is proof that they fit
         require_memory(unknowns, coarser_unknowns(scene) if to_stop and guess is None else 0)
     if to_stop:

@@ -65,7 +65,7 @@ def descend(system: System, state: State, step: Step) -> Equilibrium:
     unit = LEAST_SHIFT * float(np.median(lin.values[system.pattern.diagonal]))
     shift, unstable = 0.0, False
     for iteration in range(MAX_DESCENT):
-        if converged(system, state, lin, 0.0):
+        if converged(system, state, lin, 0.0, held=True):
             equilibrium = newton(system, state, step)
             return dataclasses.replace(equilibrium, iterations=iteration, snapped=unstable)
         refused = False

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 
 from jaxclamp.core.failures import SceneError
-from jaxclamp.physics.jaws import Jaw
+from jaxclamp.physics.jaws import Face, Jaw
 from jaxclamp.scenes.scene import Scene
 
 ALONG = np.linspace(-0.95, 0.95, 20)
@@ -28,21 +28,31 @@ def require_a_gap(scene: Scene) -> None:
 
     Raises SceneError.
     """
+    for name, jaw in scene.clamp.kinds.items():
+        _require_a_lowest_point(scene, jaw, name)
+        _require_a_distance(scene, jaw, name)
+
+
+def _require_a_lowest_point(scene: Scene, jaw: Jaw, name: str) -> None:
+    """Refuse a gap of the wrong sign below the middle or inside the jaw, or without a face there.
+
+    The face may lie back there by the depth of its teeth.
+    """
     far = 1e3 * float(scene.artery.layers[-1].inner_radius)
-    depth = 0.1 * float(scene.clamp.jaw.half_extent())
-    heights = np.array([-far, -depth, 0.0, depth])
-    gap = _seen(scene.clamp.jaw, np.zeros(4), heights, np.zeros(4))[0]
+    depth = 0.1 * float(jaw.half_extent())
+    back = sum(float(part.height(0.0, 0.0)) for part in jaw.relief) if isinstance(jaw, Face) else 0.0
+    heights = np.array([-far, back - depth, back, back + depth])
+    gap = _seen(jaw, np.zeros(4), heights, np.zeros(4))[0]
     wanted = "a gap that is positive below the jaw's lowest point, 0 there and negative inside the jaw"
     good = np.all(np.isfinite(gap)) and gap[0] > 0.0 and gap[1] > 0.0 and gap[3] < 0.0
     if not good or abs(gap[2]) > 1e-6 * depth:
         shown = ", ".join(f"{g:.3g} mm at y = {y:.3g} mm" for g, y in zip(gap, heights, strict=True))
-        raise SceneError(f"clamp.jaw of shape '{scene.clamp.jaw.shape}': expected {wanted}; it is {shown}")
-    _require_a_distance(scene)
+        raise SceneError(f"clamp.{name} of shape '{jaw.shape}': expected {wanted}; it is {shown}")
 
 
-def _require_a_distance(scene: Scene) -> None:
+def _require_a_distance(scene: Scene, jaw: Jaw, name: str) -> None:
     """Refuse a gap that is not finite near the face, or has no gradient of length 1 on it."""
-    jaw, outer = scene.clamp.jaw, scene.artery.layers[-1]
+    outer = scene.artery.layers[-1]
     extent, radius = float(jaw.half_extent()), float(outer.inner_radius + outer.thickness)
     x, z = (each.ravel() for each in np.meshgrid([0.0, radius], extent * ALONG))
     y, gap, length = face(jaw, x, z)
@@ -51,7 +61,7 @@ def _require_a_distance(scene: Scene) -> None:
     if wrong.size:
         i = wrong[0]
         raise SceneError(
-            f"clamp.jaw of shape '{jaw.shape}': expected a gap that is the distance from the face, with a "
+            f"clamp.{name} of shape '{jaw.shape}': expected a gap that is the distance from the face, with a "
             f"gradient of length 1 there; it is {gap[i]:.3g} mm with one of {length[i]:.3g} "
             f"at x = {x[i]:.3g}, y = {y[i]:.3g}, z = {z[i]:.3g} mm"
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jaxclamp.observe.figures import Record
+from jaxclamp.observe.figures import NODES_SUNK, Record
 
 ROUNDING = 1e-9
 """overlap of opposite inner walls, as part of the lumen radius, that is none: nodes on the fold lie at 0"""
@@ -34,6 +34,6 @@ def sinking(values: Record, thickness: float) -> str | None:
         return "the jaws sink into the wall: raise contact.stiffness_kPa_per_mm"
     if values["lumen_overlap_mm"] > LARGEST_SINKING * thickness:
         return "the inner walls sink into each other: raise contact.stiffness_kPa_per_mm"
-    if values["outer_radius_mm"] - values["jaw_height_mm"] > LARGEST_SINKING * thickness:
+    if values[NODES_SUNK] > LARGEST_SINKING * thickness:
         return "the jaw sinks in between the contact points of the wall: refine the mesh under it"
     return None

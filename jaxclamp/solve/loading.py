@@ -18,7 +18,6 @@ import numpy as np
 from jaxclamp.core.failures import EquilibriumError, Failure, NotConverged, SceneError
 from jaxclamp.core.parts import own_parts
 from jaxclamp.observe.figures import FIGURES
-from jaxclamp.potential.densities import RIGID
 from jaxclamp.potential.energy import State
 from jaxclamp.potential.model import Model, build_model
 from jaxclamp.potential.tangent import Linearisation
@@ -168,7 +167,7 @@ def _model(group: Any) -> Model:
     leaves = [float(leaf) if np.ndim(leaf) == 0 else leaf for leaf in known.values()]
     scene: Scene = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(outline), leaves)
     require_computable(scene)
-    require_memory(unknowns_of(scene.mesh))
+    require_memory(unknowns_of(scene))
     return build_model(scene)
 
 
@@ -190,7 +189,7 @@ def _kept(group: Any, models: list[Model]) -> Kept:
     """One converged state."""
     plain = _plain(group)
     model, e = models[plain["scene"]], plain["equilibrium"]
-    n_q, n_x, n_free = len(RIGID), model.mesh.n_nodes, model.pattern.n
+    n_q, n_x, n_free = model.discretisation.layout.n_rigid, model.mesh.n_nodes, model.pattern.n
     modes = (len(model.discretisation.stencils.modes), model.mesh.n_cells)
     state = {"x": (n_x, 3), "p": modes, "q": (n_q,)}
     lin = {

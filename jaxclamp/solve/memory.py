@@ -7,7 +7,7 @@ import numpy as np
 from jaxclamp.core.failures import TooLittleMemory
 from jaxclamp.core.memory import ADDRESSES, limits_MB, resident_MB
 from jaxclamp.fem.tube import build_tube, supports
-from jaxclamp.scenes.scene import MeshSettings, Scene
+from jaxclamp.scenes.scene import Scene
 from jaxclamp.solve.nested import to_walk_on
 
 START, PER_UNKNOWN = 850.0, 0.025
@@ -19,15 +19,15 @@ ADDRESSES_PER_MB, ADDRESSES_PER_UNKNOWN, ADDRESSES_EXPONENT = 1.2, 5e-4, 1.5
 694 MB on 500 unknowns, 757 on 9,600, 4048 on 31,000; never less than they took)"""
 
 
-def unknowns_of(mesh: MeshSettings) -> int:
+def unknowns_of(scene: Scene) -> int:
     """Degrees of freedom that move."""
-    return int(np.sum(~supports(build_tube(mesh), mesh)))
+    return int(np.sum(~supports(build_tube(scene.mesh, scene.clamp), scene.mesh)))
 
 
 def coarser_unknowns(scene: Scene) -> int:
     """Those of all coarser meshes on which the closing path is walked."""
     coarse = to_walk_on(scene)
-    return 0 if coarse is None else unknowns_of(coarse.mesh) + coarser_unknowns(coarse)
+    return 0 if coarse is None else unknowns_of(coarse) + coarser_unknowns(coarse)
 
 
 def predicted_MB(unknowns: int, of_coarser: int = 0) -> float:
@@ -67,4 +67,4 @@ def require_memory(unknowns: int, of_coarser: int = 0, processes: int = 1) -> No
 
 def require_memory_for(scene: Scene, processes: int) -> None:
     """Raise TooLittleMemory if so many processes that solve a scene at the same time will not fit."""
-    require_memory(unknowns_of(scene.mesh), coarser_unknowns(scene), processes)
+    require_memory(unknowns_of(scene), coarser_unknowns(scene), processes)

@@ -152,17 +152,18 @@ def residual_norm(lin: Linearisation) -> float:
     return float(np.linalg.norm(lin.residual)) if largest < 1e150 else math.inf
 
 
-def converged(system: System, state: State, lin: Linearisation, off: float) -> bool:
+def converged(system: System, state: State, lin: Linearisation, off: float, held: bool = False) -> bool:
     """The forces balance to the tolerance or to rounding, cells have their volume, the closing holds.
 
-    off: how far the jaw is from where the closing holds, mm
+    off: how far the jaw is from where the closing holds, mm; held: all rigid coordinates are
     """
     free = np.asarray(state.x).reshape(-1)[np.asarray(system.potential.layout.free)]
     forces = lin.values[system.pattern.diagonal] * free
     sane = float(np.max(np.abs(forces), initial=0.0)) < LARGEST_FORCE
     rounding = ROUND_OFF * float(np.linalg.norm(forces)) if sane else 0.0
     # rigid coordinates that nothing drives are in equilibrium, too
-    left = math.hypot(residual_norm(lin), float(np.linalg.norm(lin.rigid_force[1:])))
+    left = residual_norm(lin)
+    left = left if held else math.hypot(left, float(np.linalg.norm(lin.rigid_force[1:])))
     small = left <= max(system.tolerance * float(lin.reactions), rounding)
     closed = float(lin.volume_error) <= VOLUME_TOLERANCE and off <= CLOSING_TOLERANCE * system.length
     return small and closed
@@ -183,18 +184,29 @@ def bordered_step(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Newton step of equilibrium and closing condition: dx (n_free,), dq (n_q,), and |error / slope|, mm.
 
-    The first rigid coordinate is driven by the condition; the others find their own equilibrium.
-    Raises NotConverged where the condition does not feel the jaw.
+    The first rigid coordinate is driven by the condition; the others find their own equilibrium, or stay
+    where nothing touches them. Raises NotConverged where the condition does not feel the jaw.
     """
     free, per_q = responses[:, 0], responses[:, 1:]
     by_x = np.vstack([row.by_x, lin.coupling.T[1:]])
     by_q = np.vstack([row.by_q, lin.rigid_stiffness[1:]])
+    untouched = [i for i in range(1, len(by_q)) if not np.any(by_x[i]) and not np.any(by_q[i])]
+    by_q[untouched, untouched] = 1.0
     error = np.concatenate([[row.error], -lin.rigid_force[1:]])
     slopes = by_q + by_x @ per_q
     if not np.all(np.isfinite(slopes)) or np.linalg.det(slopes) == 0.0:
         raise NotConverged("the jaw does not touch the artery")
     dq = -np.linalg.solve(slopes, error + by_x @ free)
     return free + per_q @ dq, dq, abs(row.error / slopes[0, 0]) if slopes[0, 0] else math.inf
+
+
+def force_slope(lin: Linearisation, responses: np.ndarray) -> float:
+    """d jaw_force / d jaw_height at equilibrium, mN/mm, the other rigid coordinates at their own."""
+    stiffness = lin.rigid_stiffness + lin.coupling.T @ responses[:, 1:]
+    others = stiffness[1:, 1:]
+    if others.size == 0 or np.linalg.det(others) == 0.0:
+        return -float(stiffness[0, 0])
+    return -float(stiffness[0, 0] - stiffness[0, 1:] @ np.linalg.solve(others, stiffness[1:, 0]))
 
 
 def newton(
@@ -227,9 +239,15 @@ def newton(
         reuse = None
         dx, dq, off = bordered_step(responses, lin, row)
         if converged(system, state, lin, off):
-            slope = -float(lin.rigid_stiffness[0, 0]) - float(lin.coupling[:, 0] @ responses[:, 1])
             return Equilibrium(
-                state, pressure, step.axial_stretch, lin, negative, slope, responses, iteration
+                state,
+                pressure,
+                step.axial_stretch,
+                lin,
+                negative,
+                force_slope(lin, responses),
+                responses,
+                iteration,
             )
         if idle > MAX_IDLE:
             raise NotConverged("Newton's method goes in circles", residual_norm(lin), float(lin.J_min))

@@ -19,7 +19,7 @@ from jaxclamp.core.failures import EquilibriumError
 from jaxclamp.core.parts import own_parts
 from jaxclamp.observe import closure
 from jaxclamp.observe.equilibria import Equilibria
-from jaxclamp.observe.figures import FIGURES
+from jaxclamp.observe.figures import FIGURES, NODES_SUNK
 from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.observe.measures import PEAK_SHARPNESS
 from jaxclamp.potential.energy import State
@@ -180,7 +180,7 @@ class Result:
     def _record(self, kept: Kept) -> dict[str, Any]:
         """A state's record."""
         e = kept.equilibrium
-        seen = {key: value for key, value in kept.values.items() if key != "jaw_height_mm"}
+        seen = {key: value for key, value in kept.values.items() if key != NODES_SUNK}
         return (
             {"stage": kept.stage}
             | seen

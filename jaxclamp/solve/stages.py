@@ -10,6 +10,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxclamp.core.failures import EquilibriumError, Exhausted, NotConverged, TermMissing
 from jaxclamp.core.progress import Progress, Tell
@@ -115,7 +116,7 @@ class Clamping:
         self.outer_radius = float(np.asarray(body.x)[marks.outer_top, 1])
         # smoothed contact presses before it touches
         clear = self.outer_radius + 2.0 * float(self.model.scene.contact.smoothing)
-        self.first_measure = self.measure(dataclasses.replace(body, q=rigid(clear)))
+        self.first_measure = self.measure(dataclasses.replace(body, q=self.rigid(clear)))
 
     def take_over(self, *kept: Kept) -> None:
         """Go on from states that are known already, the last of them in the body."""
@@ -152,7 +153,7 @@ class Clamping:
         self.use_terms(closing=False)
         x = closed_tube(model.mesh, scene.mesh, scene.artery) if guess is None else guess.x
         self.system.length = float(np.max(np.asarray(x)[:, 1]))
-        far = rigid(self.far)
+        far = self.rigid(self.far)
         start = with_equilibrium_pressure(model.potential, x, far) if guess is None else guess
         step = Step(Held(self.far), 0.0, 1.0)
         try:
@@ -211,9 +212,12 @@ class Clamping:
         move = FIRST_TOUCH * self.outer_radius
         while True:
             touch = self.outer_radius - move
-            start = dataclasses.replace(in_body.state, q=rigid(touch))
+            start = dataclasses.replace(in_body.state, q=self.rigid(touch))
             load = f"first contact, jaw height {touch:.3f} mm"
             equilibrium = self.solve_or_descend("clamping", start, self.step(Held(touch)), load)
+            if not np.any(equilibrium.lin.coupling) and move < self.outer_radius:  # teeth, a short reach
+                move += FIRST_TOUCH * self.outer_radius
+                continue
             beyond = self.distance(equilibrium) if self.share(equilibrium.state) > 1.0 else 0.0
             if beyond == 0.0 or move == 0.0:
                 return equilibrium
@@ -288,6 +292,10 @@ class Clamping:
     def far(self) -> float:
         """A jaw height well clear of any artery the scene can make, mm."""
         return 1e3 * float(self.model.scene.artery.layers[-1].inner_radius)
+
+    def rigid(self, height: float) -> Array:
+        """Rigid coordinates with the jaws at a height, mm."""
+        return rigid(height, self.model.discretisation.layout.n_rigid)
 
     def step(self, closing: Condition) -> Step:
         """A condition under the scene's pressure and stretch."""

@@ -30,7 +30,7 @@ SMALLEST_SHARE = 1 / 16
 def on_mesh_of(model: Model, guess: Result) -> Result | None:
     """The guess, its states carried over if it has another mesh; None if it is no neighbour."""
     scene = dataclasses.replace(guess.scene, mesh=model.scene.mesh)
-    kinds = [symmetry_of(s.mesh.symmetry) for s in (guess.scene, model.scene)]
+    kinds = [symmetry_of(s.mesh, s.clamp) for s in (guess.scene, model.scene)]
     if not guess.converged or not same_kind(model.scene, scene) or kinds[0] != kinds[1]:
         return None
     if equal(model.scene.mesh, guess.scene.mesh):

@@ -98,7 +98,7 @@ def half_length_shown(result: Clamped, layers: tuple[LayerFields, ...]) -> float
     """Half the length of artery shown, mm."""
     size = float(np.max(np.abs(layers[-1].points[:, 0])))
     end = float(np.max(layers[-1].points[:, 2]))
-    return min(float(result.scene.clamp.jaw.half_extent()) + size, 2.5 * size, end)
+    return min(result.scene.clamp.half_extent() + size, 2.5 * size, end)
 
 
 # --------------------------------------------------------------------------------- unrolled

@@ -21,7 +21,7 @@ def plot_sections(result: Clamped) -> Picture:
     """Cross-section at mid-length and longitudinal section, whole artery with jaws, states A to F."""
     states = shown_states(result)
     wide, high = _largest(result)
-    jaw_half = float(result.scene.clamp.jaw.half_extent())
+    jaw_half = result.scene.clamp.half_extent()
     across, along = 1.12 * wide, max(1.15 * jaw_half + high, 1.8 * high)
     along = min(along, 1.02 * float(np.max(np.asarray(result.closing[0].state.x)[:, 2])))
     up = 1.25 * high
