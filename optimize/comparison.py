@@ -10,6 +10,7 @@ import dataclasses
 import math
 import multiprocessing
 import os
+import tomllib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from itertools import pairwise
@@ -39,6 +40,7 @@ from jaxclamp import (
     with_errors,
 )
 from jaxclamp.scenes.files import read_text
+from jaxclamp.scenes.presets import presets
 from jaxclamp.scenes.wording import did_you_mean, shortened
 from optimize.named_measures import FILE_UNIT, in_words, named
 
@@ -169,7 +171,10 @@ def tied(one: Estimate, other: Estimate) -> bool:
 def asked_clamps(
     scene: str | Path, clamps: str, overrides: Sequence[str] = (), fidelity: str = "standard"
 ) -> tuple[Asked, ...]:
-    """The scene with each clamp of a list such as "cylinder-3mm,my-jaw.toml". Raises SceneError."""
+    """The scene with each clamp of a list such as "debakey-like,cylinder-3mm,my-jaw.toml".
+
+    A preset or a file of a clamp, or of a jaw for both sides. Raises SceneError.
+    """
     names = [name.strip() for name in clamps.split(",") if name.strip()]
     if len(names) < 2:
         raise SceneError("--clamps: expected two or more, such as cylinder-3mm,flat-2mm,my-jaw.toml")
@@ -177,12 +182,23 @@ def asked_clamps(
         raise SceneError(f"--clamps: {', '.join(twice)} is there twice")
     found = []
     for name in names:
-        text, _ = read_text(name, "jaw")
+        text, key = _clamp_or_jaw(name)
         comments = [line.lstrip("#").strip() for line in text.splitlines() if line.startswith("#")]
-        one = load_scene(scene, [*overrides, f"clamp.jaw={quoted(name)}"], fidelity)
+        one = load_scene(scene, [*overrides, f"{key}={quoted(name)}"], fidelity)
         title = comments[0] if comments else name
         found.append(Asked(name, title, " ".join(filter(None, comments[1:])), one))
     return tuple(found)
+
+
+def _clamp_or_jaw(name: str) -> tuple[str, str]:
+    """The text of a preset or file, and the key of a scene that it is the value of: a jaw has a shape."""
+    known = {each.name for each in presets("clamp")}
+    text, _ = read_text(name, "clamp" if name in known else "jaw")
+    try:
+        is_jaw = "shape" in tomllib.loads(text)
+    except ValueError:  # refused with its line as the scene is read
+        is_jaw = True
+    return text, "clamp.jaw" if is_jaw else "clamp"
 
 
 def quoted(text: str) -> str:

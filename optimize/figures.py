@@ -67,7 +67,7 @@ def profile(result: Result) -> tuple[np.ndarray, np.ndarray]:
     A height that no part of the face has is not a number. z is closer together towards the sides, where
     faces rise steeply.
     """
-    jaw = result.scene.clamp.jaw
+    jaw = result.scene.clamp.jaws[0]
     reach = float(jaw.half_extent())
     z = reach * np.sin(np.linspace(-0.5 * np.pi, 0.5 * np.pi, 401))
     y, gap = map(np.asarray, _climbed(jaw, jnp.asarray(z), jnp.full(z.shape, -reach)))

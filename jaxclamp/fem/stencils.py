@@ -6,7 +6,9 @@ q: y_c = sum_a S[q, c, a] x_a, tangents of a cell, or the position and tangents 
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxclamp.core.records import record, static
 from jaxclamp.fem.elements import Element, lagrange, lobatto, tensor_rule
@@ -28,10 +30,11 @@ class FacetRule:
         return self.surface[:, :1]
 
     @property
-    def of_two(self) -> np.ndarray:
-        """Stencil of the places and tangents of a facet and of another whose nodes follow, (n_q, 6, 2 n_fn)."""
-        nothing = np.zeros_like(self.surface)
-        return np.block([[self.surface, nothing], [nothing, self.surface]])
+    def of_two(self) -> Array:
+        """Stencil of places and tangents of a facet, then of another whose nodes follow, (n_q, 6, 2 n_fn)."""
+        ours = jnp.asarray(self.surface)
+        nothing = jnp.zeros_like(ours)
+        return jnp.block([[ours, nothing], [nothing, ours]])
 
     @property
     def dN(self) -> np.ndarray:

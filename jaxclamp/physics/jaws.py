@@ -43,12 +43,7 @@ class Jaw(abc.ABC):
 
 
 class Face(Jaw):
-    """A jaw with a smooth face that is the same all across the artery, and perhaps relief on it."""
-
-    teeth: Teeth | None
-    """on the face"""
-    crown: Crown | None
-    """of the face across the artery"""
+    """A jaw with a smooth face, and perhaps relief on it: `teeth`, a `crown`."""
 
     @abc.abstractmethod
     def smooth_gap(self, point: Vector) -> Array:
@@ -61,7 +56,8 @@ class Face(Jaw):
     @property
     def relief(self) -> list[Relief]:
         """What there is on the face."""
-        return [part for part in (self.teeth, self.crown) if part is not None]
+        known = (getattr(self, "teeth", None), getattr(self, "crown", None))
+        return [part for part in known if part is not None]
 
     def gap(self, point: Vector) -> Array:
         return with_relief(self.smooth_gap, self.relief, point)
@@ -172,6 +168,56 @@ class Spline(Face):
     def smooth_curvatures(self) -> Array:
         bends = jnp.diff(self._control()) / self._spacing()
         return jnp.append(bends, 1.0 / self.edge_radius)
+
+
+@record
+class Measured(Face):
+    """A face by five numbers that callipers give: flat, edges and ends rounded, teeth along the artery."""
+
+    shape: str = static("measured")
+    length: Array = quantity("mm", 0.0, 1e3, open_lower=True)
+    """of the jaw across the artery, which lies in its middle"""
+    width: Array = quantity("mm", 0.0, 1e3, open_lower=True)
+    """along the artery, from side to side, more than twice the edge's radius"""
+    edge_radius: Array = quantity("mm", 0.0, 1e3, open_lower=True)
+    """of edges and ends"""
+    tooth_pitch: Array = quantity("mm", 0.0, 1e2, open_lower=True)
+    """from tip to tip, along the artery"""
+    tooth_depth: Array = quantity("mm", 0.0, 1e2)
+    """of the grooves; 0: smooth"""
+
+    @property
+    def teeth(self) -> Teeth:
+        """A sine along the artery, a tip in the middle."""
+        sine = {"profile": "sine", "direction": "along", "rows": 1}
+        return Teeth(**sine, pitch=self.tooth_pitch, depth=self.tooth_depth)
+
+    @property
+    def crown(self) -> None:
+        """None."""
+        return
+
+    def smooth_gap(self, point: Vector) -> Array:
+        flat = self.width / 2.0 - self.edge_radius
+        face = _rounded(jnp.abs(point[2]) - flat, point[1], flat, self.edge_radius)
+        return ended(face, jnp.abs(point[0]) - self.length / 2.0, self.edge_radius)
+
+    def half_extent(self) -> Array:
+        return jnp.asarray(self.width / 2.0)
+
+    def smooth_curvatures(self) -> Array:
+        return jnp.reshape(1.0 / self.edge_radius, 1)
+
+
+def ended(gap: Array, past_end: Array, radius: Array) -> Array:
+    """Gap of a jaw that ends across the artery, its end rounded, from that of one that goes on.
+
+    past_end: distance of the point beyond the end's foremost place, mm
+    """
+    width = radius / 5.0
+    a, b = past_end + radius, gap + radius
+    nearest_side = b + ramp(a - b, width)
+    return norm((ramp(a, width), ramp(b, width))) - radius - ramp(-nearest_side, width)
 
 
 def _rounded(past_end: Array, above: Array, half_width: Array, radius: Array) -> Array:

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxclamp.core.records import record
-from jaxclamp.core.tensors import Vector, norm, ramp
-from jaxclamp.physics.jaws import Jaw
+from jaxclamp.core.tensors import Vector, norm
+from jaxclamp.physics.jaws import Jaw, ended
 
 TIP = 0.25
 """radius of a jaw's free end over its reach, at most"""
@@ -50,10 +50,7 @@ class Placement:
         assert self.tip is not None
         assert self.reach is not None
         radius = 1.0 / (1.0 / jaw.least_radius() + 1.0 / (TIP * self.reach))
-        width = radius / 5.0
-        a, b = x - self.tip + radius, gap + radius
-        nearest_side = b + ramp(a - b, width)
-        return norm((ramp(a, width), ramp(b, width))) - radius - ramp(-nearest_side, width)
+        return ended(gap, x - self.tip, radius)
 
 
 SQUARE = Placement(oblique=None, hinge_distance=None, tip=None, reach=None)

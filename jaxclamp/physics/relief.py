@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxclamp.core.records import quantity, record, static
-from jaxclamp.core.tensors import Vector
+from jaxclamp.core.tensors import Vector, total
 
 USUAL_SHARPNESS = 4.0
 """tips of rounded wedges for which no radius is given are so many times as sharp as a sine's"""
@@ -52,7 +52,7 @@ class Teeth:
 
     def sine_radius(self) -> Array:
         """Radius of a sine's tips of that pitch and depth, mm: pitch^2 / (2 pi^2 depth)."""
-        return self.pitch**2 / (2.0 * jnp.pi**2 * jnp.maximum(self.depth, 1e-12))
+        return jnp.asarray(self.pitch**2 / (2.0 * jnp.pi**2 * jnp.maximum(self.depth, 1e-12)))
 
     def height(self, x: Array | float, z: Array | float) -> Array:
         """Height of the face inside the jaw, mm, at places across and along the artery."""
@@ -65,23 +65,24 @@ class Teeth:
 
     def _wedge(self, u: Array) -> Array:
         """A triangle wave, its corners rounded: (arccos(k cos 2 pi u) - arccos k) / (2 arcsin k)."""
-        a = _rounding(jnp.asarray(self._sharpness()))
-        k: Array = jnp.sin(a)
-        return (jnp.arccos(k * jnp.cos(2.0 * jnp.pi * u)) - (0.5 * jnp.pi - a)) / (2.0 * a)
+        a = _rounding(self._sharpness())
+        wave: Array = jnp.arccos(jnp.sin(a) * jnp.cos(2.0 * jnp.pi * u))
+        return (wave - (0.5 * jnp.pi - a)) / (2.0 * a)
 
-    def _sharpness(self) -> Array | float:
+    def _sharpness(self) -> Array:
         """The sine's radius over the tips' own."""
-        return USUAL_SHARPNESS if self.tip_radius is None else self.sine_radius() / self.tip_radius
+        if self.tip_radius is None:
+            return jnp.asarray(USUAL_SHARPNESS)
+        return self.sine_radius() / self.tip_radius
 
     def _rows(self, u: Array) -> Array:
         ridge = lambda v: jnp.where(jnp.abs(v) < 0.5, jnp.cos(jnp.pi * jnp.clip(v, -0.5, 0.5)) ** 4, 0.0)  # noqa: E731
-        return 1.0 - sum(ridge(u - (i - 0.5 * (self.rows - 1))) for i in range(self.rows))
+        return 1.0 - total(ridge(u - (i - 0.5 * (self.rows - 1))) for i in range(self.rows))
 
     def curvatures(self) -> Array:
         """Greatest curvature of the tips, 1/mm, (1,)."""
-        sine = 1.0 / self.sine_radius()
-        factor = {"sine": 1.0, "wedge": self._sharpness(), "rows": 2.0}[self.profile]
-        return jnp.reshape(sine * factor, 1)
+        factor = self._sharpness() if self.profile == "wedge" else {"sine": 1.0, "rows": 2.0}[self.profile]
+        return jnp.reshape(factor / self.sine_radius(), 1)
 
 
 def _sine(u: Array) -> Array:

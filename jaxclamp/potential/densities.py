@@ -28,8 +28,8 @@ Density = Callable[[Tensor, Rigid, Any], Array]
 
 RIGID = ("jaw_height", "clamp_height")
 """rigid coordinates q, mm: how high the upper jaw's lowest line is above the clamp's middle, and the lower
-one's below it; and, where both jaws are modelled, how high that middle is above the artery's axis: no force but
-the jaws' acts on the clamp, so that both press alike"""
+one's below it; and, where both jaws are modelled, how high that middle is above the artery's axis: no force
+but the jaws' acts on the clamp, so that both press alike"""
 
 
 def rigid(height: float, n_rigid: int = 1) -> Array:

@@ -29,7 +29,6 @@ from jaxclamp.fem.pattern import Layout, Region
 from jaxclamp.fem.stencils import Stencils
 from jaxclamp.fem.tube import closed_radii
 from jaxclamp.physics.contact import Contact
-from jaxclamp.physics.placement import Placement
 from jaxclamp.potential.bodies import Body, facet_areas, pressure_stiffness, solids
 from jaxclamp.potential.densities import (
     Blood,
@@ -301,7 +300,8 @@ def _jaw_reasons(scene: Scene) -> dict[str, str]:
 
 def _jaws(made: Made) -> Iterator[Term]:
     areas = facet_areas(made.body, made.stencils.contact, outer=True)
-    placement, jaws = _placement(made), dict(zip(SIDES, made.clamp.jaws, strict=True))
+    outer = closed_radii(made.body.mesh, made.settings, made.artery)[-1]
+    placement, jaws = made.clamp.placement(outer), dict(zip(SIDES, made.clamp.jaws, strict=True))
     for name, facets in made.sides.items():
         here = Touch(
             jaw=jaws[name],
@@ -314,15 +314,6 @@ def _jaws(made: Made) -> Iterator[Term]:
         yield Term(
             name=JAWS, region=f"{name} outside", stencil="contact", density=jaw_energy, here=here, moved=True
         )
-
-
-def _placement(made: Made) -> Placement:
-    """Where the jaws come from: the reach counts from the side of the closed artery without load."""
-    clamp, tip = made.clamp, None
-    if clamp.reach is not None:
-        tip = clamp.reach - closed_radii(made.body.mesh, made.settings, made.artery)[-1]
-    hinge = None if clamp.closing is None else clamp.closing.hinge_distance
-    return Placement(oblique=clamp.oblique, hinge_distance=hinge, tip=tip, reach=clamp.reach)
 
 
 def _intima_reasons(scene: Scene) -> dict[str, str]:
@@ -380,7 +371,7 @@ def build_potential(
     terms: Iterable[Term | Volume], regions: dict[str, Region], stencils: Stencils, layout: Layout
 ) -> Potential:
     """Terms, grouped by the points that they share."""
-    at = {
+    at: dict[str, Array | np.ndarray] = {
         "cells": stencils.cells,
         "lumen": stencils.lumen.surface,
         "contact": stencils.contact.position,

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxclamp.core.failures import BadKey
 from jaxclamp.core.records import UNIT_FACTOR
-from jaxclamp.physics.jaws import Face, Spline
+from jaxclamp.physics.jaws import Face, Measured, Spline
 from jaxclamp.physics.relief import Teeth
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.scene import Artery, Layer, Scene
@@ -228,8 +228,16 @@ def check_jaws(scene: Scene) -> None:
                     "slopes that keep the middle the lowest point of the jaw; "
                     f"here it lies {-np.min(height):.3g} mm above the lowest",
                 )
-        if isinstance(jaw, Face) and jaw.teeth is not None:
-            check_teeth(jaw, jaw.teeth, f"clamp.{name}.teeth", scene)
+        if isinstance(jaw, Measured) and not float(jaw.edge_radius) < 0.5 * float(jaw.width):
+            most = 0.5 * float(jaw.width)
+            raise refuse(
+                f"clamp.{name}.edge_radius_mm",
+                float(jaw.edge_radius),
+                f"less than half the width, {most:.3g} mm",
+            )
+        teeth = getattr(jaw, "teeth", None)
+        if isinstance(jaw, Face) and teeth is not None:
+            check_teeth(jaw, teeth, f"clamp.{name}.teeth", scene)
 
 
 def check_teeth(jaw: Face, teeth: Teeth, path: str, scene: Scene) -> None:

@@ -164,19 +164,23 @@ def _parsed(text: str, source: str) -> dict[str, Any]:
 
 
 def _expand(table: dict[str, Any], source: str) -> None:
-    """Put presets and files in place of their names (of an artery, of a jaw)."""
+    """Put presets and files in place of their names (of an artery, of a clamp, of a jaw)."""
+    for key in ("artery", "clamp"):
+        _put_in(table, key, key, key, source)
     clamp = table.get("clamp")
-    places = [(table, "artery", "artery")]
     if isinstance(clamp, dict):
-        places += [(clamp, key, "jaw") for key in ("jaw", "upper", "lower")]
-    for owner, key, kind in places:
-        name = owner.get(key)
-        if isinstance(name, str):
-            where = key if kind == "artery" else f"clamp.{key}"
-            try:
-                owner[key] = parsed(read_text(name, kind)[0])
-            except SceneError as error:
-                raise SceneError(f"{source}: {where} = {schema.shown(name)}: {error}") from None
+        for key in ("jaw", "upper", "lower"):
+            _put_in(clamp, key, "jaw", f"clamp.{key}", source)
+
+
+def _put_in(owner: dict[str, Any], key: str, kind: str, where: str, source: str) -> None:
+    """Put a preset or a file of a kind in place of its name, if a key has one."""
+    name = owner.get(key)
+    if isinstance(name, str):
+        try:
+            owner[key] = parsed(read_text(name, kind)[0])
+        except SceneError as error:
+            raise SceneError(f"{source}: {where} = {schema.shown(name)}: {error}") from None
 
 
 # --------------------------------------------------------------------------------- table to scene

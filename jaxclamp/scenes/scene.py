@@ -18,6 +18,7 @@ from jaxclamp.core.records import UNIT_FACTOR, quantity, record, static
 from jaxclamp.physics.contact import Contact
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.physics.materials import Material
+from jaxclamp.physics.placement import Placement
 
 
 @record
@@ -93,6 +94,12 @@ class Clamp:
         if self.jaw is not None:
             return {"jaw": self.jaw}
         return dict(zip(("upper", "lower"), self.jaws, strict=True))
+
+    def placement(self, outer_radius: Array) -> Placement:
+        """How the jaws lie across an artery whose outer radius without load is given, mm."""
+        tip = None if self.reach is None else self.reach - outer_radius
+        hinge = None if self.closing is None else self.closing.hinge_distance
+        return Placement(oblique=self.oblique, hinge_distance=hinge, tip=tip, reach=self.reach)
 
     def half_extent(self) -> float:
         """Distance along the artery from the middle to the side of the wider jaw, mm."""

@@ -1,7 +1,7 @@
 """The jaw's face for other programs: its profile as CSV, and a solid with that face as STL. All in mm.
 
 In the jaw's own coordinates: the origin is its lowest point above mid-length, x runs across the artery, y up
-into the jaw, z along the artery. Both jaws are alike; the lower one is the mirror image in y.
+into the jaw, z along the artery. The lower jaw is seen in its mirror image in y.
 """
 
 from __future__ import annotations
@@ -16,12 +16,21 @@ import numpy as np
 
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.pictures.fields import jaw_outline
+from jaxclamp.pictures.jaws import same_across
+from jaxclamp.scenes.scene import Clamp
 
 PROFILE, SOLID = "jaw.csv", "jaw.stl"
 SLIVER = 1e-3
 """points nearer to each other than this part of their mean distance are one"""
+ACROSS, ALONG = 161, 241
+"""points of a face that changes across the artery"""
+SHORT_OF_SIDES = 0.999
+"""share of a face's quarter circles that is sampled: its sides may be upright"""
 STRAIGHT = 1e-7
 """sine of an angle that counts as none"""
+
+
+_gap = jax.jit(lambda jaw, point: jaw.gap(point))
 
 
 @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # it runs four times
@@ -119,13 +128,50 @@ def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     )
 
 
-def write_jaw(jaw: Jaw, height: float, half_width: float, folder: Path) -> list[Path]:
-    """Write the profile and the solid, which reaches to `height` and over |x| <= half_width, mm."""
+def block(jaw: Jaw, height: float, half_width: float) -> tuple[np.ndarray, np.ndarray]:
+    """A closed surface whose lower side is a face that changes across the artery, too: points, triangles.
+
+    Its back is flat, at `height`, its sides straight, where the face ends along the artery.
+    """
+    extent = float(jaw.half_extent())
+    x = np.linspace(-half_width, half_width, ACROSS)
+    z = extent * np.sin(np.linspace(-0.5, 0.5, ALONG) * np.pi * SHORT_OF_SIDES)
+    places = np.stack([g.ravel() for g in np.meshgrid(x, z, indexing="ij")])
+    least, most = np.full(places.shape[1], -extent), np.full(places.shape[1], max(height, extent))
+    for _ in range(60):
+        middle = 0.5 * (least + most)
+        inside = np.asarray(_gap(jaw, (places[0], middle, places[1]))) < 0.0
+        least, most = np.where(inside, least, middle), np.where(inside, middle, most)
+    face = np.stack([places[0], most, places[1]], axis=1)
+    back = face * [1.0, 0.0, 1.0] + [0.0, max(height, float(np.max(most)) + extent), 0.0]
+    number = np.arange(x.size * z.size).reshape(x.size, z.size)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    lower = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    rim = np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
+    following, n = np.roll(rim, -1), number.size
+    sides = [np.stack(t, axis=-1) for t in ((rim, rim + n, following), (following, rim + n, following + n))]
+    return np.concatenate([face, back]), np.concatenate([lower, lower[:, ::-1] + n, *sides])
+
+
+def write_jaws(clamp: Clamp, height: float, half_width: float, folder: Path) -> list[Path]:
+    """Write profile and solid of each kind of jaw; solids reach to `height`, over |x| <= half_width, mm."""
+    return [
+        path
+        for name, jaw in clamp.kinds.items()
+        for path in write_jaw(jaw, height, half_width, folder, "" if name == "jaw" else f"_{name}")
+    ]
+
+
+def write_jaw(jaw: Jaw, height: float, half_width: float, folder: Path, which: str = "") -> list[Path]:
+    """Write the profile and the solid of one jaw; which: at the end of the files' names."""
     import meshio
 
     face, section = profile(jaw, height)
     rows = "".join(f"{z:.6f},{y:.6f}\n" for z, y in face + 0.0)
-    (folder / PROFILE).write_text(f"z_mm,y_mm\n{rows}", encoding="utf-8", newline="")
-    points, triangles = solid(section, half_width)
-    meshio.write(folder / SOLID, meshio.Mesh(points, [("triangle", triangles)]), binary=True)
-    return [folder / PROFILE, folder / SOLID]
+    profile_path, solid_path = (
+        folder / f"{Path(name).stem}{which}{Path(name).suffix}" for name in (PROFILE, SOLID)
+    )
+    profile_path.write_text(f"z_mm,y_mm\n{rows}", encoding="utf-8", newline="")
+    points, triangles = solid(section, half_width) if same_across(jaw) else block(jaw, height, half_width)
+    meshio.write(solid_path, meshio.Mesh(points, [("triangle", triangles)]), binary=True)
+    return [profile_path, solid_path]

@@ -15,9 +15,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from jaxclamp.pictures.fields import jaw_height_shown, jaw_outline, layer_fields, whole
+from jaxclamp.pictures.jaws import face_surface, is_drawn_out, jaw_gaps, touches
 from jaxclamp.pictures.tensors import with_fibres, with_tensors
 from jaxclamp.potential.model import Model
-from jaxclamp.show.jaw import write_jaw
+from jaxclamp.show.jaw import write_jaws
 
 if TYPE_CHECKING:
     from jaxclamp.solve.results import Kept, Result
@@ -40,20 +41,19 @@ def write_states(
 
     (folder / FOLDER).mkdir(exist_ok=True)
     full = is_whole(result.model)
-    jaw, widest = result.scene.clamp.jaw, _widest(result)
-    outline = jaw_outline(jaw, 2.0 * widest)
+    widest = _widest(result)
     index: list[tuple[float, str, str]] = []
     for number, (kept, time) in enumerate(zip(result.states, times(result), strict=True)):
         tell(number / len(result.states), f"state {number + 1} of {len(result.states)}")
         for part, made in (
             ("artery", artery_mesh(result, kept, full)),
-            ("jaws", jaw_mesh(result, kept, outline, full)),
+            ("jaws", jaw_mesh(result, kept, widest, full)),
         ):
             name = f"{FOLDER}/{part}_{number:03d}.vtu"
             meshio.write(folder / name, made, compression="zlib")
             index.append((time, part, name))
     (folder / INDEX).write_text(pvd(index), encoding="utf-8")
-    of_jaw = write_jaw(jaw, 2.0 * widest, SIDE_MARGIN * widest, folder)
+    of_jaw = write_jaws(result.scene.clamp, 2.0 * widest, SIDE_MARGIN * widest, folder)
     return [*(folder / name for _, _, name in index), folder / INDEX, *of_jaw]
 
 
@@ -123,32 +123,54 @@ def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {name: v.reshape(len(v), 9) if v.ndim == 3 else v for name, v in joined.items()}
 
 
-def jaw_mesh(result: Result, kept: Kept, outline: np.ndarray, full: bool = True) -> Any:
+def jaw_mesh(result: Result, kept: Kept, widest: float, full: bool = True) -> Any:
     """The jaws of a state as a meshio mesh of quadrilaterals: both, or only the upper one where just that is
-    modelled and shown.
+    modelled and shown. A jaw that is not the same all across the artery is its face alone.
 
-    outline: closed curve (z, y) of the jaw, mm, from `jaw_outline`
+    widest: half the width of the artery, mm
     """
     import meshio
 
     physiological = result.physiological
     open_height = None if physiological is None else physiological.values["outer_radius_mm"]
     height = jaw_height_shown(kept.model, kept.state, open_height)
-    half_width = SIDE_MARGIN * _widest(result)
+    half_width, top = SIDE_MARGIN * widest, 2.0 * widest
+    of = touches(kept.model)
+    points, cells, jaws, count = [], [], [], 0
+    for side, gap in jaw_gaps(kept.model, kept.state, height).items():
+        if side < 0 and not (full or "y" not in result.model.symmetry):
+            continue
+        touch = of[-1] if side < 0 else of[0]
+        if is_drawn_out(touch):
+            middle = float(np.sum(np.asarray(kept.state.q)[1:]))
+            found, quads = _drawn_out(jaw_outline(touch.jaw, top), height, side, half_width)
+            found = found + [0.0, middle, 0.0]
+        else:
+            found, quads = face_surface(gap, side, half_width, 1.2 * result.scene.clamp.half_extent(), top)
+        points.append(found)
+        cells.append(quads + count)
+        jaws.append(np.full(len(quads), int(side < 0)))
+        count += len(found)
+    return meshio.Mesh(
+        np.concatenate(points),
+        [("quad", np.concatenate(cells))],
+        cell_data={"jaw": [np.concatenate(jaws)]},
+    )
+
+
+def _drawn_out(
+    outline: np.ndarray, height: float, side: int, half_width: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A section (z, y) of a jaw drawn out across the artery: points (n, 3), quadrilaterals (m, 4)."""
     z, y = outline[:-1].T
     n = len(z)
-    upper = np.concatenate(
-        [np.stack([np.full(n, x), height + y, z], axis=1) for x in (-half_width, half_width)]
+    points = np.concatenate(
+        [np.stack([np.full(n, x), side * (height + y), z], axis=1) for x in (-half_width, half_width)]
     )
     around = np.arange(n)
     following = (around + 1) % n
     quads = np.stack([around, following, n + following, n + around], axis=1)
-    points, cells, jaw = upper, quads, np.zeros(n, dtype=int)
-    if full or "y" not in result.model.symmetry:
-        points = np.concatenate([upper, upper * [1.0, -1.0, 1.0]])
-        cells = np.concatenate([quads, quads[:, ::-1] + len(upper)])
-        jaw = np.repeat([0, 1], n)
-    return meshio.Mesh(points, [("quad", cells)], cell_data={"jaw": [jaw]})
+    return points, quads if side > 0 else quads[:, ::-1]
 
 
 def _widest(result: Result) -> float:

@@ -114,8 +114,7 @@ class Clamping:
         self.body_stresses = stresses(potential, body) if body_stresses is None else body_stresses
         self.lumen_radius = self.system.length = half_height(body.x, marks)
         self.outer_radius = float(np.asarray(body.x)[marks.outer_top, 1])
-        # smoothed contact presses before it touches
-        clear = self.outer_radius + 2.0 * float(self.model.scene.contact.smoothing)
+        clear = self.outer_radius + 2.0 * float(self.model.scene.contact.smoothing)  # it presses before
         self.first_measure = self.measure(dataclasses.replace(body, q=self.rigid(clear)))
 
     def take_over(self, *kept: Kept) -> None:

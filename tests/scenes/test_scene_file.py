@@ -473,7 +473,7 @@ def test_layers_are_refused_exactly_where_the_closing_map_has_no_radius(angle):
     inner_squared = (middle * share) ** 2 - (middle**2 - layer["inner_radius_mm"] ** 2) * share
     if inner_squared > 0:
         scene = loads(table)
-        radii = np.asarray(closed_radii(build_tube(scene.mesh), scene.mesh, scene.artery))
+        radii = np.asarray(closed_radii(build_tube(scene.mesh, scene.clamp), scene.mesh, scene.artery))
         assert np.all(np.diff(radii) > 0)
         assert radii[0] > 0
     else:

@@ -8,7 +8,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import PathPatch, Polygon
 from matplotlib.path import Path as Outline
 
-from jaxclamp.pictures.fields import WholeGrid, jaw_height_shown, jaw_outline, whole_positions
+from jaxclamp.pictures.fields import WholeGrid, jaw_height_shown, whole_positions
+from jaxclamp.pictures.jaws import jaw_gaps, jaw_sections
 from jaxclamp.pictures.plots.states import Clamped, meshes_of, shown_states
 from jaxclamp.pictures.plots.style import INK, JAW, JAW_EDGE, LARGE, SMALL, Picture, layer_colour, plain
 
@@ -32,7 +33,6 @@ def plot_sections(result: Clamped) -> Picture:
     gap = 0.12 * across  # between one state and the next
     widths = [across, along, gap] * columns
     grid = figure.add_gridspec(rows, len(widths) - 1, width_ratios=widths[:-1])
-    outline = jaw_outline(result.scene.clamp.jaw, 2.0 * up)
     open_height = result.closing[0].values["outer_radius_mm"]
     for place, (letter, index) in enumerate(states.items()):
         kept, record = result.closing[index], result.history[index]
@@ -40,16 +40,10 @@ def plot_sections(result: Clamped) -> Picture:
         height = jaw_height_shown(kept.model, kept.state, open_height)
         left = figure.add_subplot(grid[row, 3 * column])
         right = figure.add_subplot(grid[row, 3 * column + 1])
-        for side in (1, -1):
-            _bar(left, side * height, side * 2.0 * up, across)
-            right.add_artist(
-                Polygon(
-                    np.stack([outline[:, 0], side * (height + outline[:, 1])], axis=1),
-                    facecolor=JAW,
-                    edgecolor=JAW_EDGE,
-                    linewidth=0.9,
-                )
-            )
+        for jaw in jaw_gaps(kept.model, kept.state, height).values():
+            for axes, half_width in ((left, 1.1 * across), (right, 1.1 * along)):
+                for curve in jaw_sections(jaw, axes is left, half_width, 1.1 * up):
+                    axes.add_artist(Polygon(curve, facecolor=JAW, edgecolor=JAW_EDGE, linewidth=0.9))
         for number in range(len(result.scene.artery.layers)):
             layer = whole_positions(kept.model, kept.state, number)
             _cross_section(left, layer, number)
@@ -69,12 +63,6 @@ def _largest(result: Clamped) -> tuple[float, float]:
     grids = [whole_positions(kept.model, kept.state, outermost) for kept in result.closing]
     rings = np.abs(np.concatenate([grid.points[grid.middle, :, -1] for grid in grids]))
     return float(np.max(rings[:, 0])), float(np.max(rings[:, 1]))
-
-
-def _bar(axes: Axes, face: float, back: float, across: float) -> None:
-    """The jaw in the cross-section at mid-length."""
-    corners = [(-2 * across, face), (2 * across, face), (2 * across, back), (-2 * across, back)]
-    axes.add_artist(Polygon(corners, facecolor=JAW, edgecolor=JAW_EDGE, linewidth=0.9))
 
 
 def _cross_section(axes: Axes, layer: WholeGrid, number: int) -> None:

@@ -1,4 +1,4 @@
-"""What ships with the package as TOML: whole scenes, and arteries and jaws to put into scenes.
+"""What ships with the package as TOML: whole scenes, and arteries, jaws and clamps to put into scenes.
 
 A preset is a file `KIND/NAME.toml` below this folder. Its first line is a comment with its title;
 the comments after it name the sources. Names are unique over all kinds.
@@ -19,6 +19,7 @@ KINDS = {
     "scene": ("scenes", "as SCENE"),
     "artery": ("arteries", "as the value of artery"),
     "jaw": ("jaws", "as the value of clamp.jaw"),
+    "clamp": ("clamps", "as the value of clamp"),
     "study": ("studies", "as STUDY of jaxclamp optimise"),
 }
 """kind -> its folder, and what a preset of that kind is used for"""
