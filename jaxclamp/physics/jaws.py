@@ -189,8 +189,9 @@ class Measured(Face):
     @property
     def teeth(self) -> Teeth:
         """A sine along the artery, a tip in the middle."""
-        sine = {"profile": "sine", "direction": "along", "rows": 1}
-        return Teeth(**sine, pitch=self.tooth_pitch, depth=self.tooth_depth)
+        return Teeth(
+            profile="sine", direction="along", rows=1, pitch=self.tooth_pitch, depth=self.tooth_depth
+        )
 
     @property
     def crown(self) -> None:
