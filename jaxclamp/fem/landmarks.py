@@ -30,6 +30,8 @@ class Landmarks:
     """inner surface on the compression axis, along the modelled part, (n,)"""
     outer_top: int = static()
     """outer surface, compression axis, mid-length"""
+    P_line: np.ndarray
+    """inner surface of P's layer on the compression axis, along the modelled part, (n,)"""
     P_layer: int = static()
     """layer of P: the innermost one called "media", or the innermost"""
     P_cell: int = static()
@@ -84,6 +86,7 @@ def find_landmarks(mesh: Mesh, settings: MeshSettings, layer_names: tuple[str, .
         lumen_ring=np.array([mesh.node(0, c % mesh.grid[1], middle) for c in ring]),
         lumen_line=np.array([mesh.node(0, top, z) for z in range(mesh.grid[2])]),
         outer_top=mesh.node(-1, top, middle),
+        P_line=np.array([mesh.node(mesh.layer_inner_line(layer), top, z) for z in range(mesh.grid[2])]),
         P_layer=layer,
         P_cell=cell,
         P_weights=extrapolation(element)[corner],

@@ -21,6 +21,7 @@ from jaxclamp.fem.landmarks import lumen_area, lumen_height, lumen_width
 from jaxclamp.observe import closure
 from jaxclamp.observe.balance import balance
 from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.injury import damage_of_layer, over_thresholds, told
 from jaxclamp.observe.measures import (
     contact_of_a_jaw,
     contact_points,
@@ -329,6 +330,10 @@ FIGURES = (
         contract=False,
         shown=("peaks",),
     ),
+    Figure(
+        "damage", "damage, mean", by_layer(damage_of_layer), stressed, order=POINT, shown=("summary", "peaks")
+    ),
+    Figure("injury", "above your thresholds", over_thresholds, stressed),
 )
 
 
@@ -357,9 +362,11 @@ def read_figures(equilibria: Equilibria) -> Record:
     """
     views = dict.fromkeys(figure.view for figure in FIGURES)
     found: Record = {}
+    seen = dataclasses.replace(equilibria, injury=tuple(given.unsourced for given in equilibria.injury))
     for view in views:
-        found |= _read(view, equilibria)
+        found |= _read(view, seen)
     found = jax.tree_util.tree_map(lambda leaf: np.asarray(leaf).tolist(), jax.device_get(found))
+    found["injury"] = told(equilibria.injury, found["injury"])
     names = equilibria.marks.layer_names
     in_order = lambda v: {n: _defined(v[n]) for n in names} if isinstance(v, dict) else _defined(v)  # noqa: E731
     return {figure.key: in_order(found[figure.key]) for figure in FIGURES}

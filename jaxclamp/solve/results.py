@@ -126,6 +126,7 @@ class Result:
             potential=self.model.potential,
             marks=self.model.marks,
             states=(self.physiological.state, *closed),
+            injury=self.scene.injury,
         )
 
     @property
@@ -303,8 +304,13 @@ class Result:
 
 
 def flat(record: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """A record's numbers by column: KEY, KEY.LAYER, and KEY.LAYER.x and so on for places."""
+    """A record's numbers by column: KEY, KEY.LAYER, KEY.LAYER.x for places, KEY[0].NAME for thresholds."""
     for key, value in record.items():
+        if isinstance(value, list) and (not value or isinstance(value[0], dict)):
+            for number, item in enumerate(value):
+                numbers = {k: v for k, v in item.items() if isinstance(v, float)}
+                yield from flat(numbers, f"{prefix}{key}[{number}].")
+            continue
         if isinstance(value, dict):
             yield from flat(value, f"{prefix}{key}.")
         elif isinstance(value, list | tuple):

@@ -35,7 +35,7 @@ from jaxclamp.scenes.files import dump_scene, loads_scene
 from jaxclamp.scenes.scene import Scene
 
 KIND = "jaxclamp result"
-LAYOUT = 3
+LAYOUT = 4
 """raised with every change of what is in a file, or of what a scene makes (mesh, order of unknowns)"""
 HEADER = 512
 """bytes before the HDF5 part"""
