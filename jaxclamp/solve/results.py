@@ -153,6 +153,12 @@ class Result:
             return self.load_free
         return self.coarser.load_free_like(kept)
 
+    def in_body_like(self, kept: Kept) -> Kept | None:
+        """The state in the body on the mesh of one of the states."""
+        if self.coarser is None or kept.model is self.model:
+            return self.physiological
+        return self.coarser.in_body_like(kept)
+
     @property
     def physiological(self) -> Kept | None:
         """The state in the body; None if it did not converge."""
@@ -295,6 +301,12 @@ class Result:
         from jaxclamp.pictures import plots
 
         return plots.plot_axial_stress_maps(self)
+
+    def plot_damage_maps(self) -> Picture:
+        """Damage of every layer in the last state."""
+        from jaxclamp.pictures import plots
+
+        return plots.plot_damage_maps(self)
 
     def plot_force_travel(self) -> Picture:
         """Jaw force and occlusion against jaw travel."""

@@ -16,8 +16,11 @@ from jaxclamp.observe.injury import (
     damage_of_constituent,
     damage_of_energies,
 )
+from jaxclamp.pictures.fields import layer_fields
 from jaxclamp.scenes.files import loads_scene
 from jaxclamp.scenes.schema import toml_value
+from jaxclamp.show.console import summary
+from jaxclamp.show.report import page
 from jaxclamp.solve.clamping import inflate
 from laws import every_law
 
@@ -306,3 +309,39 @@ def test_a_scene_made_in_python_is_held_to_the_same():
     scene = dataclasses.replace(jc.load_scene("human-lad", SMALL), injury=(given,))
     with pytest.raises(jc.SceneError, match="one of media, adventitia"):
         jc.clamp(scene)
+
+
+# --- what a reader sees -------------------------------------------------------------------------------------
+
+
+def test_console_and_page_say_above_your_threshold_and_give_no_verdict(result):
+    content = result.to_dict()
+    text = "\n".join(summary(content, []))
+    share, peak = (content["final"]["injury"][0][key] for key in ("share_above", "peak_over_threshold"))
+    line = f"axial stress, media: {share:.2%} of the volume above 15 kPa, peak {peak:.3g} of it"
+    assert f"{line} (made up, as every number of this test)" in text
+    assert "contact pressure excess, under the jaws" in text
+    assert f"{'damage, media':<36}{content['final']['damage']['media']:>10.4g}" in text
+    web = page(result, [])
+    for said in ("Above your thresholds", "as every number of this test", f"{share:.2%} of the volume"):
+        assert said in web
+    for verdict in ("safe", "unsafe", "injured tissue", "acceptable", "dangerous"):
+        assert verdict not in text + web
+    bare = summary({"final": content["final"] | {"injury": []}}, [])
+    assert not any("threshold" in line for line in bare)
+
+
+def test_nodes_show_the_damage_of_the_points_around(result):
+    """Fields of files and maps: 0 in the body, within 0 and 1, and in the mean what the figure says."""
+    kept, body = result.states[-1], result.physiological
+    assert result.in_body_like(kept) is body
+    for layer in layer_fields(kept.model, kept.state, body=body.state):
+        values = layer.point_data["damage"]
+        assert np.min(values) >= 0.0
+        assert 0.2 < np.max(values) <= 1.0
+        mean = np.sum(values * layer.volumes) / np.sum(layer.volumes)
+        assert mean == pytest.approx(result.final["damage"][layer.name], rel=0.3)  # the mesh is coarse
+    for layer in layer_fields(body.model, body.state, body=body.state):
+        assert np.max(layer.point_data["damage"]) == 0.0
+    coarse = result.on_the_way[0]
+    assert result.in_body_like(coarse).model is coarse.model

@@ -138,7 +138,7 @@ def test_faces_steeper_than_a_height_can_tell_are_drawn():
         found.append(Clamped(asked, at_stop=result, ranked=estimate(1.0 + len(found), 0.1)))
     assert np.any(np.isnan(profile(found[1].at_stop)[1]))
     plates = plates_of(Comparison("", *ranking(None, LAYERS), None, tuple(found)))
-    assert [plate.name for plate in plates] == ["ranking", "axial_stress"]
+    assert [plate.name for plate in plates] == ["ranking", "axial_stress", "damage"]
     assert all(len(png(plate.figure, 50)) > 5000 for plate in plates)
 
 

@@ -451,7 +451,7 @@ def test_every_named_measure_is_a_measure_of_a_result():
     problem, unit = one_slope(), {"mN": "N", "1/mm": "per_mm"}
     result = jc.clamp(problem.scene)
     for key, found in named().items():
-        given = {"layer": "media", "stress": 20.0}
+        given = {"layer": "media", "stress": 20.0, "onset_stretch": 1.27}
         measure = found.factory(**{name: given[name] for name in found.arguments})
         assert math.isfinite(result.measure(measure)), key
         assert key.endswith(unit.get(measure.unit, measure.unit))
