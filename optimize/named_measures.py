@@ -89,10 +89,11 @@ def in_words(measure: Measure) -> str:
     """A measure for a reader, such as "smooth peak axial stress of the media"; a user's own as it prints."""
     if measure.name not in {factory.__name__ for factory in jc.MEASURES}:
         return str(measure)
-    said = " {:g} kPa" if measure.name == jc.volume_above.__name__ else " (onset stretch {:g})"
-    numbers = [said.format(a) for a in measure.arguments if isinstance(a, float)]
+    numbers = [a for a in measure.arguments if isinstance(a, float)]
+    above = [f" {a:g} kPa" for a in numbers if measure.name == jc.volume_above.__name__]
+    onset = [f" (onset stretch {a:g})" for a in numbers if not above]
     layer = [f" of the {a}" for a in measure.arguments if isinstance(a, str)][-1:]
-    return "".join([measure.name.replace("_", " "), *numbers, *layer])
+    return "".join([measure.name.replace("_", " "), *above, *layer, *onset])
 
 
 def read_measure(
