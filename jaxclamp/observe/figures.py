@@ -70,8 +70,8 @@ class Figure:
     order: float | None = None
     """order of convergence for the estimate of its error; None: none is given"""
     shown: tuple[str, ...] = ()
-    """where it is listed: "summary" (console), "headlines", "numbers" and "peaks" (report), "study" and
-    "study peaks" (a study's page)"""
+    """where it is listed: "summary" (console), "headlines", "numbers", "peaks" and "means" (report), "study"
+    and "study peaks" (a study's page)"""
 
     @property
     def unit(self) -> str:
@@ -330,9 +330,7 @@ FIGURES = (
         contract=False,
         shown=("peaks",),
     ),
-    Figure(
-        "damage", "damage, mean", by_layer(damage_of_layer), stressed, order=POINT, shown=("summary", "peaks")
-    ),
+    Figure("damage", "damage", by_layer(damage_of_layer), stressed, order=POINT, shown=("summary", "means")),
     Figure("injury", "above your thresholds", over_thresholds, stressed),
 )
 

@@ -214,6 +214,12 @@ def _numbers(content: dict[str, Any], result: Result) -> str:
         at = ["place of the axial peak: x, y, z (mm)"]
         at += [_place(places.get(name) or (), symmetry) for name in layers]
         parts.append(table(["highest stress in the last state", *layers], [*rows, at]))
+        rows = [
+            [figure.label, *(number(final[figure.key].get(name), figure.key) for name in layers)]
+            for figure in shown_in("means")
+            if final.get(figure.key)
+        ]
+        parts.append(table(["mean over the layer in the last state", *layers], rows))
         parts.append(
             '<p class="faint">Lumen sizes are those of the whole artery at mid-length. Peaks are over the '
             "quadrature points; x runs along the fold axis, y along the compression axis, z along the "
