@@ -27,9 +27,20 @@ from jaxclamp.core.progress import Progress  # noqa: E402
 from jaxclamp.core.records import quantity, record, static  # noqa: E402
 from jaxclamp.observe.equilibria import Equilibria  # noqa: E402
 from jaxclamp.observe.figures import shown_in  # noqa: E402
+from jaxclamp.observe.injury import (  # noqa: E402
+    MEASURES,
+    damage_at_points,
+    intima_contact_area,
+    mean_damage,
+    peak_over_threshold,
+    share_above_threshold,
+    smooth_peak_axial_strain_gradient,
+    smooth_peak_axial_stress_ratio,
+    smooth_peak_contact_pressure_excess,
+    smooth_peak_damage,
+)
 from jaxclamp.observe.measure import Measure, N, kPa, mm, mm2, mN, uJ  # noqa: E402
 from jaxclamp.observe.measures import (  # noqa: E402
-    MEASURES,
     axial_stress_at_P,
     circumferential_stress_at_P,
     clamp_force,
@@ -62,7 +73,7 @@ from jaxclamp.physics.jaws import Jaw  # noqa: E402
 from jaxclamp.physics.materials import FibreLaw, Material  # noqa: E402
 from jaxclamp.scenes.address import replace  # noqa: E402
 from jaxclamp.scenes.files import dump_scene, load_scene, require_possible  # noqa: E402
-from jaxclamp.scenes.scene import Scene, Stop  # noqa: E402
+from jaxclamp.scenes.scene import InjuryThreshold, Scene, Stop  # noqa: E402
 from jaxclamp.sensitivity.adjoint import value_and_gradient  # noqa: E402
 from jaxclamp.sensitivity.gradients import gradients  # noqa: E402
 from jaxclamp.sensitivity.implicit import evaluate  # noqa: E402
@@ -83,6 +94,7 @@ __all__ = [
     "Failure",
     "FibreLaw",
     "ForceStop",
+    "InjuryThreshold",
     "Jaw",
     "Material",
     "Measure",
@@ -107,11 +119,13 @@ __all__ = [
     "clamp_force",
     "contact_pressures",
     "cores",
+    "damage_at_points",
     "deformation_gradient",
     "dump_scene",
     "evaluate",
     "gradients",
     "import_parts",
+    "intima_contact_area",
     "jaw_curvature",
     "jaw_half_width",
     "jaw_travel",
@@ -123,22 +137,29 @@ __all__ = [
     "lumen_width",
     "mN",
     "mean_contact_pressure",
+    "mean_damage",
     "measures",
     "mm",
     "mm2",
     "neighbours",
     "own_parts",
+    "peak_over_threshold",
     "physiological_lumen_radius",
     "quantity",
     "record",
     "replace",
     "require_memory_for",
     "require_possible",
+    "share_above_threshold",
     "shown_in",
     "smooth_maximum",
+    "smooth_peak_axial_strain_gradient",
     "smooth_peak_axial_stress",
+    "smooth_peak_axial_stress_ratio",
     "smooth_peak_circumferential_stress",
     "smooth_peak_contact_pressure",
+    "smooth_peak_contact_pressure_excess",
+    "smooth_peak_damage",
     "smooth_peak_principal_stress",
     "static",
     "stored_energy",

@@ -214,7 +214,7 @@ def ranking(text: str | None, layers: tuple[str, ...]) -> tuple[str, Measure]:
     """
     usual = "media" if "media" in layers else layers[0]
     key, _, layer = (text or smooth_peak_axial_stress.__name__).partition(".")
-    known = {k: each for k, each in named().items() if set(each.arguments) <= {"layer"}}
+    known = {k: each for k, each in named().items() if set(each.required) <= {"layer"}}
     short = {each.factory.__name__: each for each in known.values()}
     chosen = known.get(key) or short.get(key)
     if chosen is None:

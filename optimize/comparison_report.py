@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxclamp import BadFolder, Progress
 from jaxclamp.pictures.plots import Plate, png, svg
-from jaxclamp.pictures.plots.maps import plot_axial_stress_side_by_side
+from jaxclamp.pictures.plots.maps import plot_axial_stress_side_by_side, plot_damage_side_by_side
 from jaxclamp.pictures.plots.style import (
     AXIAL,
     FAINT,
@@ -22,7 +22,7 @@ from jaxclamp.pictures.plots.style import (
     dress,
     legend,
 )
-from jaxclamp.show.console import as_json
+from jaxclamp.show.console import as_json, thresholds
 from jaxclamp.show.export import write_outputs
 from jaxclamp.show.report import document, figure_section, number, section, table
 from optimize.comparison import Clamped, Comparison, path, row
@@ -87,6 +87,12 @@ def plates_of(found: Comparison) -> list[Plate]:
             "its thickness, on one scale. A cross marks the highest of all."
         )
         plates.append(Plate("axial_stress", "Where it pulls", said, plot_axial_stress_side_by_side(results)))
+        said = (
+            "Damage of the innermost layer at the scene's stop in the same view, on one scale: the share of "
+            "its strain energy that a point would lose by a law that begins at the energy in the body. "
+            "Post-processed; a scale to compare clamps on."
+        )
+        plates.append(Plate("damage", "Where it damages", said, plot_damage_side_by_side(results)))
     if any(each.closed is not None for each in found.clamps):
         said = (
             "Force on one jaw against its travel from first contact, to closure (mark) and on to the same "
@@ -161,6 +167,7 @@ def page(found: Comparison, plates: list[tuple[Plate, bytes]]) -> str:
         section("Ranking", said + table(head, rows, 2)),
         figure_section(plates),
         section("At the scene's stop, closed, and at equal force", _figures(found)),
+        section("Above your thresholds", _thresholds(found)),
         section("What failed, or is in doubt", f"<ul>{''.join(failed)}</ul>" if failed else ""),
         section("Clamps", table(["clamp", "what it is", "source of its numbers"], _sources(found), 3)),
     ]
@@ -176,9 +183,22 @@ SHOWN = (
     ("jaw_travel_mm", "travel of each jaw"),
     ("smooth_peak_axial_stress_kPa", "smooth peak axial stress"),
     ("axial_stress_at_P_kPa", "axial stress at P"),
+    ("damage", "damage, mean"),
     ("max_contact_pressure_kPa", "greatest contact pressure"),
     ("closed_length_mm", "closed length"),
 )
+
+
+def _thresholds(found: Comparison) -> str:
+    """Table of the scene's thresholds at its stop, clamp by clamp; nothing if there are none."""
+    rows = [
+        [each.asked.name, *row]
+        for each in found.clamps
+        if each.at_stop is not None
+        for row in thresholds(each.at_stop.final)
+    ]
+    head = ["clamp", "at the scene's stop", "threshold", "share above", "peak over threshold", "source"]
+    return table(head, rows, 6) if rows else ""
 
 
 def _figures(found: Comparison) -> str:

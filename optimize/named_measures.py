@@ -15,6 +15,8 @@ from optimize.numbers import MOST, number
 
 FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
 """internal unit -> unit in files, and internal units in one of it; the others are the same"""
+ONSETS = (1.001, 100.0)
+"""least and greatest stretch at which damage may be said to begin"""
 
 
 def _layer(value: Any, path: str, layers: tuple[str, ...]) -> str:
@@ -35,7 +37,16 @@ def _stress(value: Any, path: str, _layers: tuple[str, ...]) -> float:
     return number(value, path, -MOST, MOST, "a stress in kPa")
 
 
-_READERS: dict[str, Callable[[Any, str, tuple[str, ...]], Any]] = {"layer": _layer, "stress": _stress}
+def _onset_stretch(value: Any, path: str, _layers: tuple[str, ...]) -> float:
+    """A stretch at which damage begins. Raises SceneError."""
+    return number(value, path, *ONSETS, "a stretch")
+
+
+_READERS: dict[str, Callable[[Any, str, tuple[str, ...]], Any]] = {
+    "layer": _layer,
+    "stress": _stress,
+    "onset_stretch": _onset_stretch,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,8 +62,14 @@ class Named:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Further keys that the file has to give, such as ("layer",)."""
+        """Further keys that the file can give, such as ("layer",)."""
         return tuple(inspect.signature(self.factory).parameters)
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Those of them that it has to give."""
+        known = inspect.signature(self.factory).parameters
+        return tuple(name for name, parameter in known.items() if parameter.default is parameter.empty)
 
 
 def named() -> dict[str, Named]:
@@ -72,9 +89,11 @@ def in_words(measure: Measure) -> str:
     """A measure for a reader, such as "smooth peak axial stress of the media"; a user's own as it prints."""
     if measure.name not in {factory.__name__ for factory in jc.MEASURES}:
         return str(measure)
-    numbers = [f" {a:g} kPa" for a in measure.arguments if isinstance(a, float)]
+    numbers = [a for a in measure.arguments if isinstance(a, float)]
+    above = [f" {a:g} kPa" for a in numbers if measure.name == jc.volume_above.__name__]
+    onset = [f" (onset stretch {a:g})" for a in numbers if not above]
     layer = [f" of the {a}" for a in measure.arguments if isinstance(a, str)][-1:]
-    return "".join([measure.name.replace("_", " "), *numbers, *layer])
+    return "".join([measure.name.replace("_", " "), *above, *layer, *onset])
 
 
 def read_measure(
@@ -93,7 +112,8 @@ def read_measure(
         own = "" if nearest(key, list(known)) else f" ({ONES_OWN})"
         raise SceneError(f"{path}.measure = {shown(key)}: no such measure; {said}{own}")
     chosen = known[key]
-    given = {name: _READERS[name](table.get(name), f"{path}.{name}", layers) for name in chosen.arguments}
+    wanted = [name for name in chosen.arguments if name in table or name in chosen.required]
+    given = {name: _READERS[name](table.get(name), f"{path}.{name}", layers) for name in wanted}
     allowed = ("measure", *chosen.arguments, *others)
     for name in table:
         if name not in allowed:

@@ -24,9 +24,12 @@ def injuries(layers: tuple[str, ...]) -> tuple[Measure, ...]:
         jc.smooth_peak_axial_stress,
         jc.smooth_peak_circumferential_stress,
         jc.smooth_peak_principal_stress,
+        jc.mean_damage,
     )
     contact = (jc.smooth_peak_contact_pressure(), jc.mean_contact_pressure(), jc.clamp_force())
-    return contact + tuple(factory(layer) for factory in by_layer for layer in layers)
+    return (*contact, jc.smooth_peak_axial_strain_gradient()) + tuple(
+        factory(layer) for factory in by_layer for layer in layers
+    )
 
 
 @dataclasses.dataclass(frozen=True)

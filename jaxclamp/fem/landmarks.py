@@ -32,6 +32,8 @@ class Landmarks:
     """its mirror image, where that is modelled, (n,)"""
     outer_top: int = static()
     """outer surface, compression axis, mid-length"""
+    P_line: np.ndarray
+    """inner surface of P's layer on the compression axis, along the modelled part, (n,)"""
     P_layer: int = static()
     """layer of P: the innermost one called "media", or the innermost"""
     P_cell: int = static()
@@ -88,6 +90,7 @@ def find_landmarks(mesh: Mesh, settings: MeshSettings, layer_names: tuple[str, .
         lumen_line=line(top),
         opposite_line=None if bottom is None else line(bottom),
         outer_top=mesh.node(-1, top, middle),
+        P_line=np.array([mesh.node(mesh.layer_inner_line(layer), top, z) for z in range(mesh.grid[2])]),
         P_layer=layer,
         P_cell=cell,
         P_weights=extrapolation(element)[corner],

@@ -14,6 +14,7 @@ from jaxclamp.observe.stresses import Stresses, layer_stresses
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.potential.energy import State, stored_energy
 from jaxclamp.potential.terms import JAWS, Potential
+from jaxclamp.scenes.scene import InjuryThreshold
 
 
 @record
@@ -31,6 +32,8 @@ class Equilibria:
     known_wall: tuple[Any, Any] | None = None
     """energy of the wall in the last state, uJ, and its derivative by the nodes, mN, (n_nodes, 3), where they
     are at hand"""
+    injury: tuple[InjuryThreshold, ...] = ()
+    """the thresholds of the scene's user"""
 
     @property
     def body(self) -> State:

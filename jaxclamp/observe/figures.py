@@ -21,6 +21,7 @@ from jaxclamp.fem.landmarks import lumen_area, lumen_height, lumen_width
 from jaxclamp.observe import closure
 from jaxclamp.observe.balance import balance
 from jaxclamp.observe.equilibria import Equilibria
+from jaxclamp.observe.injury import damage_of_layer, over_thresholds, told
 from jaxclamp.observe.measures import (
     contact_of_a_jaw,
     contact_points,
@@ -71,8 +72,8 @@ class Figure:
     order: float | None = None
     """order of convergence for the estimate of its error; None: none is given"""
     shown: tuple[str, ...] = ()
-    """where it is listed: "summary" (console), "headlines", "numbers" and "peaks" (report), "study" and
-    "study peaks" (a study's page)"""
+    """where it is listed: "summary" (console), "headlines", "numbers", "peaks" and "means" (report), "study"
+    and "study peaks" (a study's page)"""
 
     @property
     def unit(self) -> str:
@@ -336,6 +337,8 @@ FIGURES = (
         contract=False,
         shown=("peaks",),
     ),
+    Figure("damage", "damage", by_layer(damage_of_layer), stressed, order=POINT, shown=("summary", "means")),
+    Figure("injury", "above your thresholds", over_thresholds, stressed),
 )
 
 
@@ -364,9 +367,11 @@ def read_figures(equilibria: Equilibria) -> Record:
     """
     views = dict.fromkeys(figure.view for figure in FIGURES)
     found: Record = {}
+    seen = dataclasses.replace(equilibria, injury=tuple(given.unsourced for given in equilibria.injury))
     for view in views:
-        found |= _read(view, equilibria)
+        found |= _read(view, seen)
     found = jax.tree_util.tree_map(lambda leaf: np.asarray(leaf).tolist(), jax.device_get(found))
+    found["injury"] = told(equilibria.injury, found["injury"])
     names = equilibria.marks.layer_names
     in_order = lambda v: {n: _defined(v[n]) for n in names} if isinstance(v, dict) else _defined(v)  # noqa: E731
     return {figure.key: in_order(found[figure.key]) for figure in FIGURES}

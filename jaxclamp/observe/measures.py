@@ -120,7 +120,7 @@ def jaw_half_width() -> Measure:
     return Measure("jaw_half_width", "mm", _jaw_half_width)
 
 
-MEASURES: tuple[Callable[..., Measure], ...] = (
+MECHANICAL: tuple[Callable[..., Measure], ...] = (
     smooth_peak_axial_stress,
     smooth_peak_circumferential_stress,
     smooth_peak_principal_stress,
@@ -139,7 +139,7 @@ MEASURES: tuple[Callable[..., Measure], ...] = (
     jaw_curvature,
     jaw_half_width,
 )
-"""every factory: study files can name those at the stop by the measure's name and unit"""
+"""the factories of this module; `injury.MEASURES` has all"""
 
 
 # --- the functions ------------------------------------------------------------------------------
@@ -214,8 +214,16 @@ def _smooth_peak_contact_pressure(e: Equilibria) -> Array:
 def _volume_above(e: Equilibria, layer: str, threshold: float) -> Array:
     number = e.marks.layer(layer)
     dV = e.potential.layers[number].solid.dV
-    width = SMOOTHNESS_OF_THRESHOLD * abs(threshold) + 1e-9
-    return jnp.sum(dV * sigmoid((e.stresses(number).axial - threshold) / width)) / jnp.sum(dV)
+    return smooth_share_above(e.stresses(number).axial, dV, threshold)
+
+
+def smooth_share_above(values: Array, weights: Array, threshold: Array | float) -> Array:
+    """Share of the weights whose value is above a threshold, see `SMOOTHNESS_OF_THRESHOLD`; 0 without any."""
+    width = SMOOTHNESS_OF_THRESHOLD * jnp.abs(threshold) + 1e-9
+    whole = jnp.sum(weights)
+    there = whole > 0.0
+    above = jnp.sum(weights * sigmoid((values - threshold) / width))
+    return jnp.where(there, above / jnp.where(there, whole, 1.0), 0.0)
 
 
 def _wall_energy(e: Equilibria) -> Array:

@@ -17,8 +17,8 @@ import cloudpickle
 from jaxclamp.core.failures import Failure, SceneError
 from jaxclamp.core.parts import Source, is_shipped, sources
 from jaxclamp.core.records import concrete_subclasses, withdraw
+from jaxclamp.observe.injury import MEASURES, ONSET_STRETCH
 from jaxclamp.observe.measure import Measure
-from jaxclamp.observe.measures import MEASURES
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.physics.materials import Material
 from jaxclamp.scenes import schema
@@ -28,7 +28,7 @@ from jaxclamp.scenes.wording import shortened
 
 BASES = {"jaw": Jaw, "law": Material, "stop": Stop}
 """what a file may have records of"""
-ARGUMENTS: dict[str, Any] = {"layer": "media", "stress": 1.0}
+ARGUMENTS: dict[str, Any] = {"layer": "media", "stress": 1.0, "onset_stretch": ONSET_STRETCH}
 """what a study file can give to a measure, each with an example (stress: kPa)"""
 LARGEST_FILE = 1_000_000
 """bytes"""
@@ -201,7 +201,7 @@ def _check_factory(factory: Callable[..., Measure], said: str) -> None:
     what = f"{said}: measure {factory.__name__}"
     for name in inspect.signature(factory).parameters:
         if name not in ARGUMENTS:
-            raise SceneError(f"{what} takes {name}: a study file can give {' and '.join(ARGUMENTS)} only")
+            raise SceneError(f"{what} takes {name}: a study file can give {', '.join(ARGUMENTS)} only")
     try:
         made = _example(factory)
     except Exception as error:

@@ -47,6 +47,10 @@ class Material(abc.ABC):
         """Strain energy per stress-free volume, kPa."""
         return self.U(det(F)) + self.psi_bar(F)
 
+    def constituents(self, F: Tensor) -> list[Array]:
+        """psi_bar by constituent, kPa; a law that does not tell them apart is one."""
+        return [self.psi_bar(F)]
+
 
 class FibreLaw(Material):
     """A law of I1, J and the I4 of fibre families: psi_bar is a function of these few numbers.
@@ -62,6 +66,18 @@ class FibreLaw(Material):
     @abc.abstractmethod
     def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
         """psi_bar, kPa, of I1 = F : F, J = det F > 0, and I4 = |F a|**2 of each family."""
+
+    def parts_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> list[Array]:
+        """psi_of by constituent, kPa, the matrix first; a law that does not tell them apart is one."""
+        return [self.psi_of(I1, J, I4)]
+
+    def constituents(self, F: Tensor) -> list[Array]:
+        """parts_of the invariants of F; +inf where det F <= 0."""
+        J = det(F)
+        inside = J > 0.0
+        I4 = [squared(v) for v in self.fibres(F)]
+        parts = self.parts_of(squared_norm(F), jnp.where(inside, J, 1.0), I4)
+        return [jnp.where(inside, part, jnp.inf) for part in parts]
 
     def psi_bar(self, F: Tensor) -> Array:
         """psi_of the invariants of F; +inf where det F <= 0."""
@@ -134,16 +150,19 @@ class HGO(FibreLaw):
         return _two_families(self.fibre_angle)
 
     def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        return total(self.parts_of(I1, J, I4))
+
+    def parts_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> list[Array]:
         scale = J ** (-2.0 / 3.0)
         fibre_scale = scale if self.fibre_invariant == "isochoric" else 1.0
-        energy = _matrix(self.c, scale * I1)
+        parts = [_matrix(self.c, scale * I1)]
         for stretch_squared in I4:
             E = jnp.maximum(fibre_scale * stretch_squared - 1.0, 0.0)  # fibres carry tension only
             fibre = exponential_stiffening(self.k2, E)
             if self.fibre_energy == "eq10":
                 fibre = fibre - E * E / 2.0
-            energy = energy + self.k1 * fibre
-        return energy
+            parts.append(self.k1 * fibre)
+        return parts
 
 
 @record
@@ -172,10 +191,13 @@ class GOH(FibreLaw):
         return _two_families(self.fibre_angle)
 
     def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        return total(self.parts_of(I1, J, I4))
+
+    def parts_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> list[Array]:
         scale = J ** (-2.0 / 3.0)
-        energy = _matrix(self.c, scale * I1)
+        parts = [_matrix(self.c, scale * I1)]
         I1_part = self.dispersion * (scale * I1 - 3.0)
         for stretch_squared in I4:
             E = I1_part + (1.0 - 3.0 * self.dispersion) * (scale * stretch_squared - 1.0)
-            energy = energy + self.k1 * exponential_stiffening(self.k2, jnp.maximum(E, 0.0))
-        return energy
+            parts.append(self.k1 * exponential_stiffening(self.k2, jnp.maximum(E, 0.0)))
+        return parts

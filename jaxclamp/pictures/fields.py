@@ -19,6 +19,7 @@ from jaxclamp.fem.elements import Element
 from jaxclamp.fem.grid import Mesh
 from jaxclamp.fem.landmarks import extrapolation, tensor_nodes
 from jaxclamp.fem.symmetry import AXES, Symmetry
+from jaxclamp.observe.injury import damage_of_group
 from jaxclamp.observe.stresses import facet_contact, stresses
 from jaxclamp.physics.jaws import Jaw
 from jaxclamp.potential.energy import State
@@ -32,6 +33,8 @@ STRESSES = {
     "greatest_principal_stress_kPa": "greatest",
 }
 """name of a nodal field -> attribute of `observe.stresses.Stresses`"""
+DAMAGE = "damage"
+"""name of the nodal field, see `observe.injury.damage_at_points`"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,10 +73,13 @@ def layer_nodes(mesh: Mesh, layer: int) -> np.ndarray:
     return np.unique(mesh.cells[:, first:last])
 
 
-def layer_fields(model: Model, state: State, start: State | None = None) -> tuple[LayerFields, ...]:
+def layer_fields(
+    model: Model, state: State, start: State | None = None, body: State | None = None
+) -> tuple[LayerFields, ...]:
     """The modelled part, layer by layer.
 
-    start: the state from which displacements count; none are given without it
+    start: the state from which displacements count; body: that in the body, which damage is against. Neither
+    is given without it
     """
     mesh, element = model.mesh, model.mesh.element
     modes = element.pressure_modes(tensor_nodes(element))
@@ -91,7 +97,11 @@ def layer_fields(model: Model, state: State, start: State | None = None) -> tupl
             name: extrapolation(element) @ np.asarray(getattr(s, key)) for name, key in STRESSES.items()
         }
         corners["pressure_kPa"] = pressure[:, first:last]
+        if body is not None:
+            corners[DAMAGE] = extrapolation(element) @ np.asarray(_damage(group, body, state))
         data = {name: averaged(cells, values, len(nodes)) for name, values in corners.items()}
+        if body is not None:
+            data[DAMAGE] = np.clip(data[DAMAGE], 0.0, 1.0)  # extrapolated beyond what it can be
         data["contact_pressure_kPa"] = touch[nodes]
         if start is not None:
             data["displacement_mm"] = x[nodes] - np.asarray(start.x)[nodes]
@@ -129,7 +139,8 @@ def _summed(cells: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
     return np.bincount(cells.ravel(), np.broadcast_to(values, cells.shape).ravel(), n)
 
 
-# for a few states it is compiled for a short compilation rather than for speed
+# for a few states they are compiled for a short compilation rather than for speed
+_damage = jax.jit(damage_of_group, compiler_options={"xla_backend_optimization_level": 0})
 _contact = jax.jit(facet_contact, compiler_options={"xla_backend_optimization_level": 0})
 
 

@@ -173,12 +173,14 @@ def build_model(scene: Scene, like: Model | None = None) -> Model:
 
 
 def bare(scene: Scene) -> Scene:
-    """The scene without title and solver: programs that take it are not compiled anew for those."""
+    """The scene without title, solver and sources: programs that take it are not compiled anew for those."""
     plain = dataclasses.replace(scene.solver, tolerance=0.0, continuation="", path_mesh="", linear_solver="")
-    return dataclasses.replace(scene, title="", solver=plain)
+    injury = tuple(given.unsourced for given in scene.injury)
+    return dataclasses.replace(scene, title="", solver=plain, injury=injury)
 
 
 def same_kind(a: Scene, b: Scene) -> bool:
-    """True if two scenes differ in floats, title and solver settings only."""
-    kinds = [shape_of(dataclasses.replace(s, title="", solver=a.solver), np.shape) for s in (a, b)]
+    """True if two scenes differ in floats, title, solver settings and thresholds only."""
+    alike = lambda s: dataclasses.replace(s, title="", solver=a.solver, injury=())  # noqa: E731
+    kinds = [shape_of(alike(s), np.shape) for s in (a, b)]
     return bool(kinds[0] == kinds[1])

@@ -62,6 +62,7 @@ def check(scene: Scene) -> None:
         check_mesh,
         check_stop,
         check_solver,
+        check_injury,
     )
     for one in checks:
         one(scene)
@@ -284,6 +285,19 @@ def points_apart(scene: Scene, teeth: Teeth) -> float:
 def check_solver(scene: Scene) -> None:
     """The tolerance is within what float64 can do."""
     _check_between("solver.tolerance", scene.solver.tolerance, *TOLERANCES, "a number")
+
+
+def check_injury(scene: Scene) -> None:
+    """Thresholds of stresses name a layer, others none, and all have a source."""
+    names = [layer.name for layer in scene.artery.layers]
+    for i, given in enumerate(scene.injury):
+        path = f"injury[{i}].layer"
+        if given.of_a_layer and given.layer not in names:
+            raise refuse(path, given.layer, f"a layer for {given.measure}: one of {', '.join(names)}", names)
+        if not given.of_a_layer and given.layer:
+            raise refuse(path, given.layer, f"no layer: {given.measure} is under the jaws")
+        if not given.source.strip():
+            raise refuse(f"injury[{i}].source", given.source, "where the threshold comes from")
 
 
 def _check_ratio(path: str, value: Any, ratios: tuple[float, float], beside: tuple[str, Any]) -> None:

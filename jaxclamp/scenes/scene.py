@@ -212,6 +212,38 @@ class SolverSettings:
 
 
 @record
+class InjuryThreshold:
+    """A value from which on a user takes the wall to be injured: data with a source, not a verdict."""
+
+    measure: str = static(
+        choices=(
+            "axial_stress",
+            "circumferential_stress",
+            "principal_stress",
+            "contact_pressure",
+            "contact_pressure_excess",
+        )
+    )
+    """what it is of: a Cauchy stress in a layer, or pressure under the jaws (in excess of blood pressure)"""
+    layer: str = static("")
+    """the layer that a stress is of; none for what is under the jaws"""
+    threshold: Array = quantity("kPa", 0.0, 1e6, open_lower=True)
+    """above this"""
+    source: str = static()
+    """where the number comes from, such as author and year"""
+
+    @property
+    def of_a_layer(self) -> bool:
+        """True for a stress, False for what is under the jaws."""
+        return self.measure.endswith("stress")
+
+    @property
+    def unsourced(self) -> InjuryThreshold:
+        """The same without its source: programs that take it are not compiled anew for that."""
+        return dataclasses.replace(self, source="")
+
+
+@record
 class Scene:
     """One clamping: everything that `jaxclamp.clamp` needs."""
 
@@ -229,3 +261,5 @@ class Scene:
     """how finely it is computed"""
     solver: SolverSettings
     """and how accurately solved"""
+    injury: tuple[InjuryThreshold, ...] = ()
+    """thresholds that results are held against; any number"""

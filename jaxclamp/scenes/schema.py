@@ -319,6 +319,8 @@ def table(record: Any, path: str = "") -> dict[str, Any]:
             result[key] = _numbers(field, value, join(path, key))
         elif field.metadata.get("static"):
             result[key] = list(value) if isinstance(value, tuple) else value
+        elif isinstance(value, tuple) and not value:
+            continue  # as in a file without it
         elif isinstance(value, tuple):
             result[key] = [table(item, f"{join(path, key)}[{i}]") for i, item in enumerate(value)]
         else:

@@ -51,8 +51,9 @@ def check_value(field: dataclasses.Field[Any], hint: Any, value: Any, path: str,
         if hint is not None and not schema.is_tag(field):
             schema.check_static(field, hint, list(value) if isinstance(value, tuple) else value, path)
     elif get_origin(hint) is tuple:
-        if not isinstance(value, tuple) or not 1 <= len(value) <= MOST_ITEMS:
-            raise refuse(path, _words(value), f"a tuple of 1 to {MOST_ITEMS} parts of a scene")
+        least = 0 if field.default == () else 1
+        if not isinstance(value, tuple) or not least <= len(value) <= MOST_ITEMS:
+            raise refuse(path, _words(value), f"a tuple of {least} to {MOST_ITEMS} parts of a scene")
         for i, item in enumerate(value):
             check_part(get_args(hint)[0], item, f"{path}[{i}]", ranges)
     else:

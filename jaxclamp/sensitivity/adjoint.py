@@ -30,7 +30,7 @@ from jaxclamp.potential.energy import State, energy, settled
 from jaxclamp.potential.model import Discretisation, bare, positions, potential_of
 from jaxclamp.potential.tangent import Piece, cut, is_of_cells, piece_energy, whole
 from jaxclamp.potential.terms import Group, Potential
-from jaxclamp.scenes.scene import Scene, Stop
+from jaxclamp.scenes.scene import InjuryThreshold, Scene, Stop
 from jaxclamp.sensitivity.implicit import Unknowns, contact_forces, solution, solve_linear
 from jaxclamp.solve.results import Result
 from jaxclamp.solve.stops import stop_residual
@@ -50,6 +50,8 @@ class Sizes:
     """positions at the stop, mm, (n_nodes, 3); in a measure of the body alone, those in the body"""
     q: Array
     """rigid coordinates at the stop, mm, (n_q,)"""
+    injury: tuple[InjuryThreshold, ...]
+    """the user's thresholds"""
 
 
 def value_and_gradient(result: Result, measure: Measure) -> tuple[float, Scene]:
@@ -69,7 +71,14 @@ def value_and_gradient(result: Result, measure: Measure) -> tuple[float, Scene]:
     base, last = result.physiological.state, result.states[-1].state
     scene = jax.tree_util.tree_map(lambda leaf: jnp.asarray(leaf, float), bare(result.scene))
     x_stop = last.x if to_stop else base.x
-    at = Sizes(data=potential.data, stop=scene.stop, x_body=base.x, x_stop=x_stop, q=last.q)
+    at = Sizes(
+        data=potential.data,
+        stop=scene.stop,
+        x_body=base.x,
+        x_stop=x_stop,
+        q=last.q,
+        injury=scene.injury,
+    )
     value, slopes = _measured(measure, potential, d.marks, at)
     on_free = lambda a: np.asarray(a).reshape(-1)[free]  # noqa: E731
     by_q: Any = np.asarray(slopes.q)
@@ -100,7 +109,9 @@ def _measured(measure: Measure, potential: Potential, marks: Landmarks, at: Size
         same = potential.with_data(sizes.data)
         in_body = settled(same, sizes.x_body, jnp.zeros_like(sizes.q))
         closed = (settled(same, sizes.x_stop, sizes.q),) if measure.needs_stop else ()
-        return measure(Equilibria(potential=same, marks=marks, states=(in_body, *closed)))
+        return measure(
+            Equilibria(potential=same, marks=marks, states=(in_body, *closed), injury=sizes.injury)
+        )
 
     return jax.value_and_grad(of)(at)
 
@@ -185,7 +196,7 @@ def _by_scene(
         x, q = positions(scene, d, jnp.zeros(d.layout.free.shape)), jnp.zeros_like(measured.q)
         p = jnp.zeros((len(d.stencils.modes), d.mesh.n_cells))
         state = State(x=x, p=p, q=q)
-        known = Sizes(data=potential.data, stop=scene.stop, x_body=x, x_stop=x, q=q)
+        known = Sizes(data=potential.data, stop=scene.stop, x_body=x, x_stop=x, q=q, injury=scene.injury)
         return known, [_of_piece(whole(group, state)) for group in potential.layers]
 
     of_sizes = jax.tree_util.tree_map(jnp.subtract, measured, surfaces)
@@ -216,6 +227,7 @@ def value_and_clamp_gradient(result: Result, measure: Measure) -> tuple[float, S
         x_body=result.physiological.state.x,
         x_stop=last.x,
         q=last.q,
+        injury=scene.injury,
     )
     value, slopes = _measured_by_clamp(measure, potential, d.marks, at)
     right: Any = np.asarray(slopes.x_stop).reshape(-1)[free]
@@ -230,8 +242,12 @@ def value_and_clamp_gradient(result: Result, measure: Measure) -> tuple[float, S
 
 
 def _named(gradient: Scene, scene: Scene) -> Scene:
-    """A gradient with the title and the solver of its scene."""
-    return dataclasses.replace(gradient, title=scene.title, solver=scene.solver)
+    """A gradient with the title, the solver and the sources of its scene."""
+    injury = tuple(
+        dataclasses.replace(slope, source=given.source)
+        for slope, given in zip(gradient.injury, scene.injury, strict=True)
+    )
+    return dataclasses.replace(gradient, title=scene.title, solver=scene.solver, injury=injury)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -242,7 +258,7 @@ def _measured_by_clamp(
         same = potential.with_clamp_data(sizes.data)
         in_body = settled(same, at.x_body, jnp.zeros_like(sizes.q))
         closed = settled(same, sizes.x_stop, sizes.q)
-        return measure(Equilibria(potential=same, marks=marks, states=(in_body, closed)))
+        return measure(Equilibria(potential=same, marks=marks, states=(in_body, closed), injury=at.injury))
 
     return jax.value_and_grad(of)(at)
 

@@ -315,7 +315,7 @@ def see(scene: Scene, d: Discretisation, u: Unknowns) -> Equilibria:
 
     in_body = state(u.physiological, jnp.zeros(d.layout.n_rigid))
     closed = () if u.stop is None or u.q is None else (state(u.stop, u.q),)
-    return Equilibria(potential=potential, marks=d.marks, states=(in_body, *closed))
+    return Equilibria(potential=potential, marks=d.marks, states=(in_body, *closed), injury=scene.injury)
 
 
 _read = jax.jit(lambda measure, equilibria: measure(equilibria), static_argnums=0)

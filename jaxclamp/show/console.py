@@ -126,10 +126,28 @@ def summary(result: dict[str, Any], files: list[Path]) -> list[str]:
                 named = f"{label}, {layer}" if layer else label
                 error = _error(result, block, f"{key}.{layer}" if layer else key)
                 output.append(f"    {named:<36}{figure(number):>10} {error}{unit}".rstrip())
+    if rows := thresholds(result.get("final") or {}):
+        output += ["", "  above your thresholds"]
+        output += [
+            f"    {what}: {share} above {least}, peak {peak} of it ({said})"
+            for what, least, share, peak, said in rows
+        ]
     if branch := branch_of(result):
         output += ["", f"  equilibrium: {branch}"]
     to_open = sorted((f for f in files if f.suffix in OPEN_FIRST), key=lambda f: OPEN_FIRST.index(f.suffix))
     return output + ["", *(f"  open {path}" for path in to_open)] if to_open else output
+
+
+def thresholds(final: dict[str, Any]) -> list[list[str]]:
+    """Of each `[[injury]]` what it is of, the threshold, the share above it, the peak over it, the source."""
+    rows = []
+    for given in final.get("injury") or []:
+        what = given["measure"].replace("_", " ")
+        where = f", {given['layer']}" if given["layer"] else ", under the jaws"
+        share, peak = given["share_above"], given["peak_over_threshold"]
+        said = f"{share:.2%} of the {'volume' if given['layer'] else 'area'}"
+        rows.append([what + where, f"{given['threshold_kPa']:.4g} kPa", said, f"{peak:.3g}", given["source"]])
+    return rows
 
 
 def branch_of(result: dict[str, Any]) -> str:

@@ -100,7 +100,10 @@ def artery_mesh(result: Result, kept: Kept, full: bool = True) -> Any:
 
     load_free = result.load_free_like(kept)
     assert load_free is not None
-    layers = with_tensors(kept.model, kept.state, layer_fields(kept.model, kept.state, load_free.state))
+    body = result.in_body_like(kept)
+    in_body = None if body is None else body.state
+    fields = layer_fields(kept.model, kept.state, load_free.state, in_body)
+    layers = with_tensors(kept.model, kept.state, fields)
     layers = with_fibres(tuple(whole(layer) for layer in layers) if full else layers)
     element = kept.model.mesh.element
     starts = np.cumsum([0, *(len(layer.points) for layer in layers)])

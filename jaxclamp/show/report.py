@@ -13,7 +13,7 @@ from jaxclamp.core.failures import SceneError
 from jaxclamp.fem.symmetry import AXES, Symmetry
 from jaxclamp.observe.figures import shown_in
 from jaxclamp.pictures.fields import layer_fields
-from jaxclamp.show.console import name_and_unit
+from jaxclamp.show.console import name_and_unit, thresholds
 from jaxclamp.trust.estimates import SOURCES
 
 if TYPE_CHECKING:
@@ -82,6 +82,7 @@ def page(result: Result, plates: Iterable[tuple[Plate, bytes]]) -> str:
         _opening(title, content, result),
         figure_section(plates),
         section("Numbers", _numbers(content, result)),
+        section("Above your thresholds", thresholds_table(content["final"])),
         section("Numerical errors", _errors(content["errors"])),
         section("Checks", _checks(checks(result))),
         section("Notes", _notes(content["notes"])),
@@ -213,12 +214,32 @@ def _numbers(content: dict[str, Any], result: Result) -> str:
         at = ["place of the axial peak: x, y, z (mm)"]
         at += [_place(places.get(name) or (), symmetry) for name in layers]
         parts.append(table(["highest stress in the last state", *layers], [*rows, at]))
+        rows = [
+            [figure.label, *(number(final[figure.key].get(name), figure.key) for name in layers)]
+            for figure in shown_in("means")
+            if final.get(figure.key)
+        ]
+        parts.append(table(["mean over the layer in the last state", *layers], rows))
         parts.append(
             '<p class="faint">Lumen sizes are those of the whole artery at mid-length. Peaks are over the '
             "quadrature points; x runs along the fold axis, y along the compression axis, z along the "
             "artery, and each place stands for its mirror images in the planes of the model too.</p>"
         )
     return "\n".join(parts)
+
+
+def thresholds_table(final: dict[str, Any]) -> str:
+    """Table of the scene's `[[injury]]`; nothing if there are none."""
+    rows = thresholds(final)
+    if not rows:
+        return ""
+    said = (
+        "Shares are of a layer's volume, or of the area under the jaws where they press, in the last state. "
+        "They say how far values lie above the thresholds of the scene file, and no more: whether an artery "
+        "is injured there is for the source of the threshold to say."
+    )
+    table_ = table(["", "threshold", "share above", "peak over threshold", "source"], rows, 5)
+    return f'{table_}<p class="faint">{escape(said)}</p>'
 
 
 def _place(place: Sequence[float], symmetry: Symmetry) -> str:

@@ -126,6 +126,7 @@ class Result:
             potential=self.model.potential,
             marks=self.model.marks,
             states=(self.physiological.state, *closed),
+            injury=self.scene.injury,
         )
 
     @property
@@ -151,6 +152,12 @@ class Result:
         if self.coarser is None or kept.model is self.model:
             return self.load_free
         return self.coarser.load_free_like(kept)
+
+    def in_body_like(self, kept: Kept) -> Kept | None:
+        """The state in the body on the mesh of one of the states."""
+        if self.coarser is None or kept.model is self.model:
+            return self.physiological
+        return self.coarser.in_body_like(kept)
 
     @property
     def physiological(self) -> Kept | None:
@@ -295,6 +302,12 @@ class Result:
 
         return plots.plot_axial_stress_maps(self)
 
+    def plot_damage_maps(self) -> Picture:
+        """Damage of every layer in the last state."""
+        from jaxclamp.pictures import plots
+
+        return plots.plot_damage_maps(self)
+
     def plot_force_travel(self) -> Picture:
         """Jaw force and occlusion against jaw travel."""
         from jaxclamp.pictures import plots
@@ -303,8 +316,13 @@ class Result:
 
 
 def flat(record: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """A record's numbers by column: KEY, KEY.LAYER, and KEY.LAYER.x and so on for places."""
+    """A record's numbers by column: KEY, KEY.LAYER, KEY.LAYER.x for places, KEY[0].NAME for thresholds."""
     for key, value in record.items():
+        if isinstance(value, list) and (not value or isinstance(value[0], dict)):
+            for number, item in enumerate(value):
+                numbers = {k: v for k, v in item.items() if isinstance(v, float)}
+                yield from flat(numbers, f"{prefix}{key}[{number}].")
+            continue
         if isinstance(value, dict):
             yield from flat(value, f"{prefix}{key}.")
         elif isinstance(value, list | tuple):

@@ -98,6 +98,7 @@ class Clamping:
                 states=(base, state),
                 known_stresses=(base_stresses, seen),
                 known_wall=(equilibrium.lin.wall_energy, equilibrium.lin.wall_force),
+                injury=self.model.scene.injury,
             )
         )
         if closing:

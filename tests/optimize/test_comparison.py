@@ -70,6 +70,10 @@ def test_ranks_of_ties_and_of_clamps_that_failed():
         ("smooth_peak_axial_stress_kPa.adventitia", "smooth_peak_axial_stress_kPa.adventitia"),
         ("clamp_force_N", "clamp_force_N"),
         ("clamp_force", "clamp_force_N"),
+        ("mean_damage", "mean_damage.media"),
+        ("smooth_peak_damage.adventitia", "smooth_peak_damage.adventitia"),
+        ("smooth_peak_axial_strain_gradient", "smooth_peak_axial_strain_gradient_per_mm"),
+        ("intima_contact_area", "intima_contact_area_mm2"),
     ],
 )
 def test_names_of_measures(asked, name):
@@ -83,6 +87,7 @@ def test_names_of_measures(asked, name):
         ("clamp_force_N.media", "not of a layer"),
         ("smooth_peak_axial_stress_kPa.intima", "one of media, adventitia"),
         ("volume_above", "no such measure"),
+        ("mean_damage.intima", "one of media, adventitia"),
     ],
 )
 def test_measures_that_there_are_not(asked, said):
@@ -138,7 +143,7 @@ def test_faces_steeper_than_a_height_can_tell_are_drawn():
         found.append(Clamped(asked, at_stop=result, ranked=estimate(1.0 + len(found), 0.1)))
     assert np.any(np.isnan(profile(found[1].at_stop)[1]))
     plates = plates_of(Comparison("", *ranking(None, LAYERS), None, tuple(found)))
-    assert [plate.name for plate in plates] == ["ranking", "axial_stress"]
+    assert [plate.name for plate in plates] == ["ranking", "axial_stress", "damage"]
     assert all(len(png(plate.figure, 50)) > 5000 for plate in plates)
 
 

@@ -394,6 +394,7 @@ def test_a_wrong_study_is_one_sentence_and_exit_code_2(tmp_path, capsys, old, ne
 
 
 VOLUME = '[[constraints]]\nmeasure = "volume_above"\nlayer = "media"\nstress = {}\nupper = 0.5\n'
+DAMAGE = '[[constraints]]\nmeasure = "mean_damage"\nlayer = "media"\nonset_stretch = {}\nupper = 0.5\n'
 
 
 @pytest.mark.parametrize("number", ["9" * 400, "-" + "9" * 400, "0x" + "f" * 6000, "1e400", "inf", "nan"])
@@ -407,6 +408,7 @@ VOLUME = '[[constraints]]\nmeasure = "volume_above"\nlayer = "media"\nstress = {
         ('layer = "media"', "layer = {}", "objective.layer = "),
         ("slopes = [1.2]", "slopes = [{}]", "jaw"),
         ("[[constraints]]", VOLUME + "[[constraints]]", "constraints[0].stress = "),
+        ("[[constraints]]", DAMAGE + "[[constraints]]", "constraints[0].onset_stretch = "),
     ],
 )
 def test_numbers_that_no_float_can_hold_are_one_sentence(tmp_path, capsys, old, new, key, number):
@@ -447,11 +449,25 @@ def test_a_position_far_beyond_a_list_is_one_sentence(tmp_path, key):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(("onset", "found"), [("", 1.49), ("onset_stretch = 1.26\n", 1.26)])
+def test_a_study_may_say_where_damage_begins(tmp_path, onset, found):
+    table = DAMAGE.replace("onset_stretch = {}\n", onset)
+    study = load_study(written(tmp_path, STUDY.replace("[[constraints]]", table + "[[constraints]]")))
+    assert study.problem.constraints[0].measure == jc.mean_damage("media", found)
+
+
+@pytest.mark.parametrize("onset", ["1.0", "-2.0", '"1.49"', "true"])
+def test_an_onset_that_is_none_is_refused(tmp_path, onset):
+    table = DAMAGE.format(onset) + "[[constraints]]"
+    with pytest.raises(jc.SceneError, match=r"onset_stretch = .*expected a stretch from 1\.001 to 100"):
+        load_study(written(tmp_path, STUDY.replace("[[constraints]]", table)))
+
+
 def test_every_named_measure_is_a_measure_of_a_result():
     problem, unit = one_slope(), {"mN": "N", "1/mm": "per_mm"}
     result = jc.clamp(problem.scene)
     for key, found in named().items():
-        given = {"layer": "media", "stress": 20.0}
+        given = {"layer": "media", "stress": 20.0, "onset_stretch": 1.27}
         measure = found.factory(**{name: given[name] for name in found.arguments})
         assert math.isfinite(result.measure(measure)), key
         assert key.endswith(unit.get(measure.unit, measure.unit))

@@ -84,8 +84,8 @@ def compared(best: dict, other: dict, name: str = "reference") -> Compared:
 
 def test_every_injury_is_there_once_and_by_layer():
     found = injuries(("media", "adventitia"))
-    assert len(set(found)) == len(found) == 9
-    assert {PRESSURE, FORCE, jc.mean_contact_pressure(), PEAK} <= set(found)
+    assert len(set(found)) == len(found) == 12
+    assert {PRESSURE, FORCE, jc.mean_contact_pressure(), PEAK, jc.mean_damage("adventitia")} <= set(found)
 
 
 @pytest.mark.parametrize(
@@ -149,6 +149,7 @@ def test_measures_in_words():
     assert in_words(PEAK) == "smooth peak axial stress of the media"
     assert labelled(PEAK) == "Smooth peak axial stress of the media, kPa"
     assert in_words(jc.volume_above("media", 20.0)) == "volume above 20 kPa of the media"
+    assert in_words(jc.mean_damage("media", 1.26)) == "mean damage of the media (onset stretch 1.26)"
     assert in_words(jc.Measure("mine", "", lambda e: 0.0, ("a", 2.0))) == "mine(a, 2.0)"
 
 

@@ -14,8 +14,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxclamp.core.tensors import LARGEST_EXPONENT, det, pointwise_derivatives
-from jaxclamp.physics.materials import GOH, HGO, Material, NeoHookean
+from jaxclamp.core.tensors import LARGEST_EXPONENT, det, pointwise_derivatives, total
+from jaxclamp.physics.materials import GOH, HGO, FibreLaw, Material, NeoHookean
 from laws import every_law, example
 
 
@@ -71,6 +71,27 @@ def basis(i: int, j: int) -> jax.Array:
 
 
 # --------------------------------------------------------------------------------- every law
+
+
+@every_law
+def test_constituents_add_up(law):
+    parts = law.constituents(moderate)
+    families = len(law.directions()) if isinstance(law, FibreLaw) else 0
+    assert len(parts) == 1 + families
+    np.testing.assert_allclose(sum(parts), law.psi_bar(moderate), rtol=1e-14)
+    assert all(np.min(part) >= 0.0 for part in parts)
+    crushed = [np.isinf(part).all() for part in law.constituents(-moderate)]
+    assert all(crushed)
+
+
+def test_a_law_that_does_not_tell_its_constituents_apart_is_one():
+    class Own(HGO):
+        parts_of = FibreLaw.parts_of
+        psi_of = lambda self, I1, J, I4: total(HGO.parts_of(self, I1, J, I4))
+
+    law = Own(**{f.name: getattr(example(HGO), f.name) for f in dataclasses.fields(HGO)})
+    (whole,) = law.constituents(moderate)
+    np.testing.assert_allclose(whole, law.psi_bar(moderate), rtol=1e-14)
 
 
 @every_law

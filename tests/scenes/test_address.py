@@ -31,7 +31,7 @@ def addresses(record, path=""):
         value, name = getattr(record, field.name), f"{path}{field.name}"
         if dataclasses.is_dataclass(value):
             yield from addresses(value, f"{name}.")
-        elif isinstance(value, tuple) and dataclasses.is_dataclass(value[0]):
+        elif isinstance(value, tuple) and (not value or dataclasses.is_dataclass(value[0])):
             for i, item in enumerate(value):
                 yield from addresses(item, f"{name}[{i}].")
         else:

@@ -34,6 +34,12 @@ MEASURES = (
     jc.volume_above("media", 20.0),
     jc.stored_energy(),
     jc.physiological_lumen_radius(),
+    jc.smooth_peak_axial_stress_ratio("media"),
+    jc.smooth_peak_contact_pressure_excess(),
+    jc.smooth_peak_axial_strain_gradient(),
+    jc.mean_damage("media"),
+    jc.mean_damage("adventitia", 1.26),
+    jc.smooth_peak_damage("adventitia"),
 )
 
 FAMILIES = {

@@ -129,7 +129,7 @@ def test_figures_are_drawings_too(folder):
         root = ET.parse(path.with_suffix(".svg")).getroot()
         assert root.tag == "{http://www.w3.org/2000/svg}svg"
         assert len(list(root.iter("{http://www.w3.org/2000/svg}path"))) > 20
-    assert len(list(folder.glob("figures/*.svg"))) == 5
+    assert len(list(folder.glob("figures/*.svg"))) == 6
 
 
 def test_the_scene_is_in_both_files(folder, result):

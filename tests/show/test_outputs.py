@@ -32,7 +32,7 @@ from jaxclamp.show.report import page, write_report
 
 meshio = pytest.importorskip("meshio")
 
-FIGURES = ("axial_stress_maps", "force_travel", "sections", "stress_at_P", "wall_stress")
+FIGURES = ("axial_stress_maps", "damage_maps", "force_travel", "sections", "stress_at_P", "wall_stress")
 COARSE = ["mesh.circumferential=4", "mesh.axial=6", "mesh.radial=[2, 1]"]
 LAYERS = ("media", "adventitia")
 FINAL = (
@@ -242,7 +242,9 @@ def test_quadratic_elements_are_written_and_mirrored_too(tmp_path):
     far = jnp.asarray([100.0])
     x = closed_positions(model.mesh, scene.mesh, scene.artery)
     kept = types.SimpleNamespace(state=with_equilibrium_pressure(model.potential, x, far), model=model)
-    fake = types.SimpleNamespace(model=model, scene=scene, load_free_like=lambda kept: kept)
+    fake = types.SimpleNamespace(
+        model=model, scene=scene, load_free_like=lambda kept: kept, in_body_like=lambda kept: None
+    )
     meshio.write(tmp_path / "a.vtu", paraview.artery_mesh(fake, kept))
     (block,) = meshio.read(tmp_path / "a.vtu").cells
     assert block.type == "hexahedron27"
@@ -297,6 +299,7 @@ def pressed(symmetry: str, element: str = "q1p0"):
         scene=scene,
         load_free=load_free,
         load_free_like=lambda kept: load_free,
+        in_body_like=lambda kept: None,
         physiological=load_free,
         states=(load_free, last),
         closing=(load_free, last),
@@ -554,7 +557,7 @@ def test_whatever_converged_is_written(result, tmp_path, kept):
     content = json.loads((tmp_path / "result.json").read_text())
     assert content["converged"] is False
     assert len(list(tmp_path.glob("paraview/artery_*.vtu"))) == kept
-    assert len(list(tmp_path.glob("figures/*.png"))) == (0, 1, 5, 5)[min(kept, 3)]
+    assert len(list(tmp_path.glob("figures/*.png"))) == (0, 1, 6, 6)[min(kept, 3)]
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "The stop was not reached" in text
     assert "refine the mesh" in text

@@ -141,14 +141,16 @@ def test_gradients_through_closure(stop, closed):
     scene = dataclasses.replace(scene, solver=dataclasses.replace(scene.solver, tolerance=1e-12))
     base = jc.clamp(scene)
     paths = (*PATHS, "stop.force") if stop == "pressed" else PATHS
-    _, gradients = jc.gradients(base, MEASURES, paths=paths)
+    met = (jc.intima_contact_area(),) if "occlusion" not in stop else ()  # inner walls press on each other
+    measures = (*MEASURES, *met)
+    _, gradients = jc.gradients(base, measures, paths=paths)
     for j, path in enumerate(paths):
         value = float(jc.scenes.address.get(scene, path))
-        scale = np.array([abs(base.measure(m)) for m in MEASURES])
-        best = np.full(len(MEASURES), np.inf)
+        scale = np.array([abs(base.measure(m)) for m in measures])
+        best = np.full(len(measures), np.inf)
         for h in (1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7):
             ends = [jc.clamp(jc.replace(scene, path, value * (1.0 + s * h)), guess=base) for s in (1.0, -1.0)]
-            plus, minus = (np.array([end.measure(m) for m in MEASURES]) for end in ends)
+            plus, minus = (np.array([end.measure(m) for m in measures]) for end in ends)
             slope = (plus - minus) / (2.0 * h * value)
             size = np.maximum(np.abs(gradients[:, j]), 1e-3 * scale / value)
             best = np.minimum(best, np.abs(slope - gradients[:, j]) / size)

@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Iterator
 
 from jaxclamp.pictures.plots.curves import plot_force_travel, plot_stress_at_P
-from jaxclamp.pictures.plots.maps import plot_axial_stress_maps
+from jaxclamp.pictures.plots.maps import plot_axial_stress_maps, plot_damage_maps
 from jaxclamp.pictures.plots.sections import plot_sections
 from jaxclamp.pictures.plots.states import Clamped
 from jaxclamp.pictures.plots.style import Picture, png, svg
@@ -20,6 +20,7 @@ __all__ = [
     "Plate",
     "figures",
     "plot_axial_stress_maps",
+    "plot_damage_maps",
     "plot_force_travel",
     "plot_sections",
     "plot_stress_at_P",
@@ -74,6 +75,14 @@ PLATES = (
         "Arrows on the bar of colours: a small part of a layer, mostly where the mesh is too coarse for a "
         "fold, has stresses beyond them.",
         plot_axial_stress_maps,
+    ),
+    (
+        "damage_maps",
+        "Damage of the layers",
+        "Damage in the last state, as above: the share of its strain energy that a point would lose by a law "
+        "that begins at the energy in the body (docs/injury.md). Post-processed: the wall does not soften. A "
+        "scale to compare clamps on, not a verdict.",
+        plot_damage_maps,
     ),
     (
         "force_travel",

@@ -1,7 +1,8 @@
-"""Where the axial stress is high at the end: every layer unrolled, and as it lies under the jaw."""
+"""Where axial stress or damage is high at the end: every layer unrolled, and as it lies under the jaw."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -11,7 +12,14 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
-from jaxclamp.pictures.fields import LayerFields, WholeGrid, layer_fields, whole_grid, whole_positions
+from jaxclamp.pictures.fields import (
+    DAMAGE,
+    LayerFields,
+    WholeGrid,
+    layer_fields,
+    whole_grid,
+    whole_positions,
+)
 from jaxclamp.pictures.plots.states import Clamped, final_state
 from jaxclamp.pictures.plots.style import (
     INK,
@@ -25,7 +33,23 @@ from jaxclamp.pictures.plots.style import (
     stress_colours,
 )
 
-FIELD = "axial_stress_kPa"
+
+@dataclasses.dataclass(frozen=True)
+class Mapped:
+    """What a map shows."""
+
+    field: str
+    """of the points"""
+    label: str
+    """beside the bar of colours"""
+    step: float
+    """colours end at multiples of it"""
+    peaks: bool
+    """a cross marks the highest place: not where a plateau has it"""
+
+
+AXIAL_STRESS = Mapped("axial_stress_kPa", "axial Cauchy stress (kPa)", 5.0, peaks=True)
+OF_DAMAGE = Mapped(DAMAGE, "damage", 0.1, peaks=False)
 FROM_INSIDE, FROM_OUTSIDE = (0.50, -0.75, 0.32), (0.50, 0.75, 0.32)
 """where the observer stands: across the artery, above the jaws' mid-plane, along the artery"""
 FINER = 4
@@ -36,17 +60,32 @@ EQUALLY_HIGH = 1e-6
 
 def plot_axial_stress_maps(result: Clamped) -> Picture:
     """Axial Cauchy stress of every layer in the last state, on one colour scale."""
+    return _maps(result, AXIAL_STRESS)
+
+
+def plot_damage_maps(result: Clamped) -> Picture:
+    """Damage of every layer in the last state, on one colour scale."""
+    return _maps(result, OF_DAMAGE)
+
+
+def _final_fields(result: Clamped, mapped: Mapped) -> tuple[LayerFields, ...]:
+    """The layers in the last state, with what is mapped."""
     kept = final_state(result)
-    layers = layer_fields(kept.model, kept.state)
+    body = result.in_body_like(kept) if mapped is OF_DAMAGE else None
+    return layer_fields(kept.model, kept.state, body=None if body is None else body.state)
+
+
+def _maps(result: Clamped, mapped: Mapped) -> Picture:
+    layers = _final_fields(result, mapped)
     zoom = half_length_shown(result, layers)
-    shades = stress_range(layers, zoom)
+    shades = stress_range(layers, zoom, mapped)
     scale = ScalarMappable(Normalize(*shades.limits), stress_colours())
     figure = Picture(9.6, 2.75 * len(layers) + 0.35)
     grid = figure.add_gridspec(len(layers), 2, width_ratios=[1.0, 1.25])
     for number, layer in enumerate(layers):
         P = number == result.model.marks.P_layer
         map_axes, view_axes = (figure.add_subplot(grid[number, column]) for column in (0, 1))
-        unrolled(map_axes, layer, load_free_angles(result, number), zoom, scale, P)
+        unrolled(map_axes, layer, load_free_angles(result, number), zoom, scale, P, mapped)
         last = number == len(layers) - 1
         dress(
             map_axes,
@@ -55,24 +94,32 @@ def plot_axial_stress_maps(result: Clamped) -> Picture:
             f"{plain(layer.name)}, highest through the layer",
             grid=False,
         )
-        _view(view_axes, whole_grid(layer), zoom, scale, inside=number == 0, mark_P=P)
-    colour_bar(figure, scale, f"axial Cauchy stress (kPa){shades.said('volume')}", shades.beyond)
+        _view(view_axes, whole_grid(layer), zoom, scale, inside=number == 0, mark_P=P, mapped=mapped)
+    colour_bar(figure, scale, f"{mapped.label}{shades.said('volume')}", shades.beyond)
     return figure
 
 
 def plot_axial_stress_side_by_side(results: Mapping[str, Clamped]) -> Picture:
     """Axial Cauchy stress of the innermost layer in the last state of each result, on one colour scale."""
-    ends = {name: final_state(result) for name, result in results.items()}
-    layers = {name: layer_fields(kept.model, kept.state) for name, kept in ends.items()}
+    return _side_by_side(results, AXIAL_STRESS)
+
+
+def plot_damage_side_by_side(results: Mapping[str, Clamped]) -> Picture:
+    """Damage of the innermost layer in the last state of each result, on one colour scale."""
+    return _side_by_side(results, OF_DAMAGE)
+
+
+def _side_by_side(results: Mapping[str, Clamped], mapped: Mapped) -> Picture:
+    layers = {name: _final_fields(result, mapped) for name, result in results.items()}
     zoom = max(half_length_shown(results[name], known) for name, known in layers.items())
-    shades = stress_range([known[0] for known in layers.values()], zoom)
+    shades = stress_range([known[0] for known in layers.values()], zoom, mapped)
     scale = ScalarMappable(Normalize(*shades.limits), stress_colours())
     columns = min(3, len(results))
     rows = -(-len(results) // columns)
     figure = Picture(3.1 * columns + 0.8, 2.5 * rows + 0.4)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for number, (axes, (name, known)) in enumerate(zip(panels, layers.items(), strict=False)):
-        unrolled(axes, known[0], load_free_angles(results[name], 0), zoom, scale, mark_P=False)
+        unrolled(axes, known[0], load_free_angles(results[name], 0), zoom, scale, False, mapped)
         dress(axes, "position along the artery (mm)", "angle from the fold (deg)", plain(name), grid=False)
         axes.label_outer()
         if number + columns >= len(results):  # nothing is below
@@ -80,17 +127,17 @@ def plot_axial_stress_side_by_side(results: Mapping[str, Clamped]) -> Picture:
             axes.set_xlabel("position along the artery (mm)", fontsize=NORMAL, color=INK)
     for axes in panels[len(results) :]:
         axes.axis("off")
-    colour_bar(figure, scale, f"axial Cauchy stress (kPa){shades.said('volume')}", shades.beyond)
+    colour_bar(figure, scale, f"{mapped.label}{shades.said('volume')}", shades.beyond)
     return figure
 
 
-def stress_range(layers: Sequence[LayerFields], zoom: float) -> Colours:
-    """The range of colours for the axial stress of some layers, kPa; zoom: half the length shown, mm."""
+def stress_range(layers: Sequence[LayerFields], zoom: float, mapped: Mapped = AXIAL_STRESS) -> Colours:
+    """The range of colours for what is mapped of some layers; zoom: half the length shown, mm."""
     shown = [np.abs(layer.points[:, 2]) <= zoom for layer in layers]
     return colours(
-        [layer.point_data[FIELD][at] for layer, at in zip(layers, shown, strict=True)],
+        [layer.point_data[mapped.field][at] for layer, at in zip(layers, shown, strict=True)],
         [layer.volumes[at] for layer, at in zip(layers, shown, strict=True)],
-        5.0,
+        mapped.step,
     )
 
 
@@ -113,16 +160,22 @@ def load_free_angles(result: Clamped, layer: int) -> np.ndarray:
 
 
 def unrolled(
-    axes: Axes, layer: LayerFields, angles: np.ndarray, zoom: float, scale: ScalarMappable, mark_P: bool
+    axes: Axes,
+    layer: LayerFields,
+    angles: np.ndarray,
+    zoom: float,
+    scale: ScalarMappable,
+    mark_P: bool,
+    mapped: Mapped = AXIAL_STRESS,
 ) -> None:
     """Angle in the load-free tube (fold, jaw, fold) against current position along the artery.
 
     angles: from `load_free_angles`, deg, (n,); zoom: half the length shown, mm
     """
-    z, value = highest_through(layer)
+    z, value = highest_through(layer, mapped)
     angle = np.broadcast_to(angles, value.shape)
     inside = np.where(np.abs(z) <= zoom, value, -np.inf)
-    peaks = inside >= np.max(inside) - EQUALLY_HIGH * np.max(np.abs(value))
+    peaks = mapped.peaks & (inside >= np.max(inside) - EQUALLY_HIGH * np.max(np.abs(value)))
     axes.pcolormesh(
         z,
         angle,
@@ -146,10 +199,10 @@ def unrolled(
         _P(axes, 0.0, 90.0)
 
 
-def highest_through(layer: LayerFields) -> tuple[np.ndarray, np.ndarray]:
-    """Position along the artery (mm), highest axial stress through a layer (kPa), upper half, (n_z, n_c)."""
+def highest_through(layer: LayerFields, mapped: Mapped = AXIAL_STRESS) -> tuple[np.ndarray, np.ndarray]:
+    """Position along the artery (mm), and the highest through a layer, of the upper half, (n_z, n_c)."""
     grid = whole_grid(layer)
-    stress = grid.point_data[FIELD][:, grid.upper]
+    stress = grid.point_data[mapped.field][:, grid.upper]
     highest = np.argmax(stress, axis=2)[..., None]
     value = np.take_along_axis(stress, highest, axis=2)[..., 0]
     return np.take_along_axis(grid.points[:, grid.upper, :, 2], highest, axis=2)[..., 0], value
@@ -185,11 +238,17 @@ def _P(axes: Axes, x: float, y: float) -> None:
 
 
 def _view(
-    axes: Axes, layer: WholeGrid, zoom: float, scale: ScalarMappable, inside: bool, mark_P: bool
+    axes: Axes,
+    layer: WholeGrid,
+    zoom: float,
+    scale: ScalarMappable,
+    inside: bool,
+    mark_P: bool,
+    mapped: Mapped,
 ) -> None:
     """The upper half of a layer, shaded, from the lumen or from outside."""
     camera = _camera(FROM_INSIDE if inside else FROM_OUTSIDE)
-    quads, values = _shell(layer, zoom)
+    quads, values = _shell(layer, zoom, mapped)
     normal = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     toward = normal @ camera[2]
@@ -231,9 +290,9 @@ def _camera(toward: tuple[float, float, float]) -> np.ndarray:
     return np.stack([right, np.cross(back, right), back])
 
 
-def _shell(layer: WholeGrid, zoom: float) -> tuple[np.ndarray, np.ndarray]:
+def _shell(layer: WholeGrid, zoom: float, mapped: Mapped) -> tuple[np.ndarray, np.ndarray]:
     """Facets of the upper half's surface: corners anticlockwise from outside (n, 4, 3), values (n,)."""
-    block = np.concatenate([layer.points, layer.point_data[FIELD][..., None]], axis=-1)[:, layer.upper]
+    block = np.concatenate([layer.points, layer.point_data[mapped.field][..., None]], axis=-1)[:, layer.upper]
     block = _refined(_refined(block, 0), 1)
     keep = np.flatnonzero(np.max(np.abs(block[..., 2]), axis=(1, 2)) <= zoom)
     block = block[keep[0] : keep[-1] + 1]
