@@ -164,6 +164,12 @@ FIGURES = (
     Figure(
         "jaw_travel_mm", "travel of each jaw", _travel, order=WHOLE, shown=("summary", "numbers", "study")
     ),
+    Figure(
+        "clamp_height_mm",
+        "how high the middle of the clamp is above the artery's axis: not 0 where jaws are not alike",
+        lambda e: jnp.sum(e.last.q[1:]),
+        contract=False,
+    ),
     Figure(NODES_SUNK, "deepest node of the wall inside a jaw", _penetration_of_nodes, contract=False),
     Figure("lumen_height_mm", "lumen height", _height, order=WHOLE, shown=("summary", "numbers")),
     Figure(

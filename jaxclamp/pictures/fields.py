@@ -363,9 +363,9 @@ def jaw_outline(jaw: Jaw, height: float, n: int = 301) -> np.ndarray:
 
 
 def jaw_height_shown(model: Model, state: State, open_height: float | None) -> float:
-    """Where to draw the jaw of a state, mm above the axis: an open clamp just touches the artery.
+    """Where to draw the jaws of a state, mm from the clamp's middle: an open clamp just touches the artery.
 
     open_height: the outer radius in the body, where known
     """
-    outer = float(np.asarray(state.x)[model.marks.outer_top, 1])
+    outer = float(np.asarray(state.x)[model.marks.outer_top, 1] - np.sum(np.asarray(state.q)[1:]))
     return min(float(np.asarray(state.q)[0]), max(outer, open_height or outer))

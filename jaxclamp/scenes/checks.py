@@ -104,11 +104,8 @@ def check_proportions(scene: Scene) -> None:
     _check_ratio("artery.length_mm", scene.artery.length, LENGTHS, _widest(scene))
     for name, jaw in scene.clamp.kinds.items():
         for key, field in schema.fields_by_key(type(jaw)).items():
-            if (
-                "range" in field.metadata
-                and field.metadata["range"].unit == "mm"
-                and not field.metadata["many"]
-            ):
+            limits = field.metadata.get("range")  # a length that may be 0, such as a depth, may be small
+            if limits and limits.unit == "mm" and limits.open_lower and not field.metadata["many"]:
                 _check_ratio(f"clamp.{name}.{key}", getattr(jaw, field.name), JAW_SIZES, _widest(scene))
     wall = "the thickness of the wall", sum(float(layer.thickness) for layer in layers)
     _check_ratio("contact.smoothing_mm", scene.contact.smoothing, SMOOTHINGS, wall)
