@@ -51,9 +51,15 @@ class Symmetry:
         return "1" if self.parts == 1 else f"1/{self.parts}"
 
     @property
-    def rigid_coordinates(self) -> int:
-        """The jaws' height above the clamp's middle, and, without the plane y = 0, how high that lies."""
-        return 1 if "y" in self else 2
+    def rigid_coordinates(self) -> tuple[str, ...]:
+        """Names of the rigid coordinates, see `potential.densities`."""
+        names = {"jaw_height": True, "clamp_height": "y" not in self, "side_force": "x" not in self}
+        return tuple(name for name, there in names.items() if there)
+
+    def rigid_place(self, name: str) -> int | None:
+        """Place of a rigid coordinate among them; None where it is not there."""
+        names = self.rigid_coordinates
+        return names.index(name) if name in names else None
 
     # --- spans ------------------------------------------------------------------------------------
 

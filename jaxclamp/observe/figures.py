@@ -25,6 +25,8 @@ from jaxclamp.observe.injury import damage_of_layer, over_thresholds, told
 from jaxclamp.observe.measures import (
     contact_of_a_jaw,
     contact_points,
+    force_aside,
+    rigid_coordinate,
     smooth_peak,
     stress_at_P,
     travel_of_a_jaw,
@@ -36,7 +38,7 @@ from jaxclamp.potential.terms import JAWS
 Read = Callable[[Equilibria], Any]
 
 NODES_SUNK = "node_penetration_mm"
-"""key of a figure that is looked at and not reported"""
+"""a figure that is not reported"""
 J_OFF = 0.05
 """a wall keeps its volume; a point whose J is further from 1 is not resolved"""
 
@@ -167,7 +169,13 @@ FIGURES = (
     Figure(
         "clamp_height_mm",
         "how high the middle of the clamp is above the artery's axis: not 0 where jaws are not alike",
-        lambda e: jnp.sum(e.last.q[1:]),
+        lambda e: rigid_coordinate(e, "clamp_height"),
+        contract=False,
+    ),
+    Figure(
+        "side_force_N",
+        "force that holds the artery sideways between jaws that push it aside",
+        lambda e: 1e-3 * force_aside(e),
         contract=False,
     ),
     Figure(NODES_SUNK, "deepest node of the wall inside a jaw", _penetration_of_nodes, contract=False),

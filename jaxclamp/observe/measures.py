@@ -62,6 +62,14 @@ def clamp_force() -> Measure:
     return Measure("clamp_force", "mN", force_on_a_jaw)
 
 
+def side_force() -> Measure:
+    """Force that holds the artery sideways at the stop, mN: 0 where jaws do not push it aside.
+
+    Over twice the jaw's force, the least coefficient of friction with which nothing slides.
+    """
+    return Measure("side_force", "mN", force_aside)
+
+
 def jaw_travel() -> Measure:
     """Travel of each jaw from its first contact to the stop, mm."""
     return Measure("jaw_travel", "mm", travel_of_a_jaw)
@@ -127,6 +135,7 @@ MECHANICAL: tuple[Callable[..., Measure], ...] = (
     axial_stress_at_P,
     circumferential_stress_at_P,
     clamp_force,
+    side_force,
     jaw_travel,
     lumen_height,
     lumen_width,
@@ -168,6 +177,17 @@ def force_on_a_jaw(e: Equilibria) -> Array:
     """Force on one jaw of the whole artery, mN."""
     modelled = jnp.sum(jaw_forces(e.potential, e.last.x, e.last.q))
     return e.marks.symmetry.parts_of_a_jaw * modelled
+
+
+def rigid_coordinate(e: Equilibria, name: str) -> Array:
+    """A rigid coordinate (`densities.RIGID`); 0 where it is not there."""
+    place = e.marks.symmetry.rigid_place(name)
+    return jnp.zeros(()) if place is None else e.last.q[place]
+
+
+def force_aside(e: Equilibria) -> Array:
+    """Force that holds the whole artery sideways, mN."""
+    return e.marks.symmetry.parts * jnp.abs(rigid_coordinate(e, "side_force"))
 
 
 def travel_of_a_jaw(e: Equilibria) -> Array:

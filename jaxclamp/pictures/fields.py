@@ -362,10 +362,16 @@ def jaw_outline(jaw: Jaw, height: float, n: int = 301) -> np.ndarray:
     return max(curves, key=len)
 
 
+def clamp_height(model: Model, state: State) -> float:
+    """How high the middle of the clamp is above the artery's axis, mm."""
+    place = model.symmetry.rigid_place("clamp_height")
+    return 0.0 if place is None else float(np.asarray(state.q)[place])
+
+
 def jaw_height_shown(model: Model, state: State, open_height: float | None) -> float:
     """Where to draw the jaws of a state, mm from the clamp's middle: an open clamp just touches the artery.
 
     open_height: the outer radius in the body, where known
     """
-    outer = float(np.asarray(state.x)[model.marks.outer_top, 1] - np.sum(np.asarray(state.q)[1:]))
+    outer = float(np.asarray(state.x)[model.marks.outer_top, 1]) - clamp_height(model, state)
     return min(float(np.asarray(state.q)[0]), max(outer, open_height or outer))

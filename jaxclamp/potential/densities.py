@@ -26,10 +26,11 @@ from jaxclamp.physics.placement import Placement
 Rigid = Sequence[Array] | Array
 Density = Callable[[Tensor, Rigid, Any], Array]
 
-RIGID = ("jaw_height", "clamp_height")
-"""rigid coordinates q, mm: how high the upper jaw's lowest line is above the clamp's middle, and the lower
-one's below it; and, where both jaws are modelled, how high that middle is above the artery's axis: no force
-but the jaws' acts on the clamp, so that both press alike"""
+RIGID = ("jaw_height", "clamp_height", "side_force")
+"""rigid coordinates q: how high the upper jaw's lowest line is above the clamp's middle, and the lower one's
+below it, mm; where both jaws are modelled, how high that middle is above the artery's axis, mm: no force but
+the jaws' acts on the clamp, so that both press alike; and, where jaws may push the artery aside, the force on
+the modelled part that holds its section at mid-length where it is on average, mN (see `side_energy`)"""
 
 
 def rigid(height: float, n_rigid: int = 1) -> Array:
@@ -110,11 +111,13 @@ class Touch:
     """where the points of a facet are"""
     side: int = static(default=1)
     """1: the upper jaw, -1: the lower one, seen in its mirror image in the clamp's middle"""
+    floats: bool = static(default=False)
+    """the clamp's middle is a rigid coordinate, the second one"""
 
 
 def jaw_gap(x: Vector, q: Rigid, here: Touch) -> Array:
     """Distance of points x (components first) from the jaw, mm, positive where open."""
-    above = here.side * (x[1] - q[1]) if len(q) > 1 else here.side * x[1]
+    above = here.side * (x[1] - q[1]) if here.floats else here.side * x[1]
     return here.placement.gap(here.jaw, (x[0], above, x[2]), q[0])
 
 
@@ -167,3 +170,22 @@ def intima_energy(y: Tensor, q: Rigid, here: Meeting) -> Array:
     """
     walls = 2.0 if here.both else 1.0
     return walls * here.contact.intima_energy(half_gap(y, here)) * here.dA
+
+
+@record
+class Hold:
+    """What holds the artery sideways between the jaws."""
+
+    share: Array
+    """of each node of the section at mid-length, (1, 1)"""
+    place: int = static()
+    """of the force among the rigid coordinates"""
+
+
+def side_energy(y: Tensor, q: Rigid, here: Hold) -> Array:
+    """Force times mean sideways displacement of the section at mid-length; y: position.
+
+    A Lagrange multiplier for a mean of 0: friction under the jaws, which is not modelled, would hold the
+    artery where it was clamped; the force, shared out evenly over the section, is what it would have to hold.
+    """
+    return q[here.place] * here.share * y[0, 0]

@@ -17,18 +17,11 @@ from jaxclamp.fem.landmarks import Landmarks, find_landmarks
 from jaxclamp.fem.pattern import FACETS_PER_BLOCK, Layout, Pattern, Region, block_size, build_pattern
 from jaxclamp.fem.stencils import Stencils, build_stencils
 from jaxclamp.fem.symmetry import Symmetry
-from jaxclamp.fem.tube import build_tube, end_height, end_lines, supports
+from jaxclamp.fem.tube import build_tube, end_height, end_lines, middle_line, supports
 from jaxclamp.physics.contact import Contact
 from jaxclamp.potential.bodies import tube_body
-from jaxclamp.potential.terms import (
-    Made,
-    Potential,
-    Term,
-    Volume,
-    all_terms,
-    build_potential,
-    needed,
-)
+from jaxclamp.potential.kinds import Made, all_terms, needed
+from jaxclamp.potential.terms import Potential, Term, Volume, build_potential
 from jaxclamp.scenes.scene import Artery, Clamp, MeshSettings, Scene
 
 
@@ -105,7 +98,11 @@ def discretise(scene: Scene) -> tuple[Discretisation, Pattern]:
         mirrored = np.flip(np.arange((order + 1) ** 2).reshape(order + 1, order + 1), axis=0).ravel()
         meeting = np.concatenate([meeting, mesh.inner_facets[mirrored][:, sides["lower"]]])
     nodes["upper inside"] = (meeting, FACETS_PER_BLOCK)
-    layout, regions, pattern = build_pattern(supports(mesh, scene.mesh), nodes, symmetry.rigid_coordinates)
+    if "x" not in symmetry:
+        nodes["mid-length"] = (mesh.plane(2, middle_line(mesh, scene.mesh))[None], FACETS_PER_BLOCK)
+    layout, regions, pattern = build_pattern(
+        supports(mesh, scene.mesh), nodes, len(symmetry.rigid_coordinates)
+    )
     marks = find_landmarks(mesh, scene.mesh, tuple(layer.name for layer in scene.artery.layers))
     layout, regions = jax.device_put((layout, regions))
     return Discretisation(

@@ -4,20 +4,20 @@
                   - pressure * V_lumen(x)                                     blood pressure
                   + int phi(gap(x; q)) dA                                     jaw contact
                   + int phi(gap between the walls) dA                         intima contact
+                  + side force * mean x at mid-length                         hold sideways
 
 of the modelled part, with one, two or four pressures p per cell and M = int N_m N_n / bulk dV, so that at
 equilibrium p = bulk (J - 1) averaged over the cell (mean dilatation, Q1/P0) or projected on the linear
 functions (Q2/P1); q are the rigid coordinates (`densities.RIGID`).
 
 A term says where it lives (a region of the mesh), what it looks at there (a stencil), and its density.
-Terms of one region and stencil form a group: they are differentiated together. To add a term, write its
-density and one entry of `KINDS`.
+Terms of one region and stencil form a group: they are differentiated together. `potential.kinds` makes them.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax.numpy as jnp
@@ -27,20 +27,16 @@ from jax import Array
 from jaxclamp.core.records import record, static
 from jaxclamp.fem.pattern import Layout, Region
 from jaxclamp.fem.stencils import Stencils
-from jaxclamp.fem.tube import closed_radii
-from jaxclamp.physics.contact import Contact
-from jaxclamp.potential.bodies import Body, facet_areas, pressure_stiffness, solids
 from jaxclamp.potential.densities import (
-    Blood,
     Density,
-    Meeting,
-    Touch,
-    blood_energy,
-    intima_energy,
-    jaw_energy,
-    shape_energy,
 )
-from jaxclamp.scenes.scene import Artery, Clamp, MeshSettings, Scene
+
+SIDES = {"upper": 1, "lower": -1}
+"""sign of y of each half of the circumference"""
+BLOOD, JAWS, INTIMA, KEPT_VOLUME = "blood pressure", "jaw contact", "intima contact", "incompressibility"
+SIDE = "hold sideways"
+OF_THE_CLAMP = (JAWS, INTIMA, SIDE)
+"""terms that are only there while the jaws close"""
 
 
 @record
@@ -212,161 +208,6 @@ class Potential:
         return self.changed(BLOOD, lambda here: dataclasses.replace(here, pressure=known))
 
 
-# --- the kinds of terms ---------------------------------------------------------------------------
-
-SIDES = {"upper": 1, "lower": -1}
-"""sign of y of each half of the circumference"""
-BLOOD, JAWS, INTIMA, KEPT_VOLUME = "blood pressure", "jaw contact", "intima contact", "incompressibility"
-
-
-@dataclasses.dataclass(frozen=True)
-class Made:
-    """A scene's wall on its mesh, ready for terms."""
-
-    artery: Artery
-    """of the scene"""
-    clamp: Clamp
-    """of the scene"""
-    contact: Contact
-    """of the scene"""
-    settings: MeshSettings
-    """of the scene"""
-    body: Body
-    """the wall"""
-    stencils: Stencils
-    """of its element"""
-    sides: dict[str, np.ndarray]
-    """facets of each half of the circumference that is modelled, by its name in `SIDES`; a facet stands where
-    its mirror image stands in the other"""
-
-
-@dataclasses.dataclass(frozen=True)
-class Kind:
-    """A kind of term: why a scene needs it, and its terms."""
-
-    reasons: Callable[[Scene], dict[str, str]]
-    """name of each term -> why it is there; terms that the scene does not need are left out"""
-    terms: Callable[[Made], Iterator[Term | Volume]]
-    """for a discretised scene"""
-    of_the_clamp: str | None = None
-    """the term's name, if it is only there while the jaws close"""
-
-
-KEPT = {
-    "q1p0": "volume change averaged over each cell",
-    "q1pz": "volume change averaged over each cell; its axial slope resisted softly",
-    "q2p1": "pressure linear in each cell",
-}
-"""how the cells of each element keep their volume"""
-
-
-def _wall_reasons(scene: Scene) -> dict[str, str]:
-    return {
-        f"wall: {layer.name}": f"layer with law '{layer.material.law}', stress-free as an open sector "
-        "(residual stress needs no further term)"
-        for layer in scene.artery.layers
-    } | {KEPT_VOLUME: KEPT[scene.mesh.element]}
-
-
-def _wall(made: Made) -> Iterator[Term | Volume]:
-    names = [layer.name for layer in made.artery.layers]
-    yield from wall_terms(made.body, made.stencils, names)
-
-
-def wall_terms(body: Body, stencils: Stencils, names: Iterable[str]) -> Iterator[Term | Volume]:
-    """The terms of a body, layer by layer."""
-    known = zip(names, solids(body, stencils), body.mesh.layer_cells, strict=True)
-    for number, (name, solid, cells) in enumerate(known):
-        region, stiffness = f"layer {number}", pressure_stiffness(solid, stencils)
-        yield Term(name=f"wall: {name}", region=region, stencil="cells", density=shape_energy, here=solid)
-        yield Volume(name=KEPT_VOLUME, region=region, stencil="cells", cells=cells, stiffness=stiffness)
-
-
-def _blood_reasons(scene: Scene) -> dict[str, str]:
-    return {BLOOD: "follower load on the lumen, as enclosed volume"} if scene.artery.pressure != 0.0 else {}
-
-
-def _blood(made: Made) -> Iterator[Term]:
-    weights = jnp.asarray(made.stencils.lumen.weights)[:, None]
-    here = Blood(pressure=jnp.asarray(made.artery.pressure), weights=weights)
-    yield Term(name=BLOOD, region="lumen", stencil="lumen", density=blood_energy, here=here)
-
-
-def _jaw_reasons(scene: Scene) -> dict[str, str]:
-    shapes = " and ".join(f"'{jaw.shape}'" for jaw in scene.clamp.kinds.values())
-    jaws = "jaw" if len(scene.clamp.kinds) == 1 else "jaws"
-    return {JAWS: f"rigid {shapes} {jaws} against the outer wall, frictionless"}
-
-
-def _jaws(made: Made) -> Iterator[Term]:
-    areas = facet_areas(made.body, made.stencils.contact, outer=True)
-    outer = closed_radii(made.body.mesh, made.settings, made.artery)[-1]
-    placement, jaws = made.clamp.placement(outer), dict(zip(SIDES, made.clamp.jaws, strict=True))
-    for name, facets in made.sides.items():
-        here = Touch(
-            jaw=jaws[name],
-            placement=placement,
-            contact=made.contact,
-            dA=_some(areas, facets),
-            rule=made.stencils.contact,
-            side=SIDES[name],
-        )
-        yield Term(
-            name=JAWS, region=f"{name} outside", stencil="contact", density=jaw_energy, here=here, moved=True
-        )
-
-
-def _intima_reasons(scene: Scene) -> dict[str, str]:
-    if scene.stop.far_from_closure():
-        return {}
-    where = " in the plane of symmetry" if "y" in scene.clamp.planes else ""
-    return {INTIMA: f"opposite inner walls meet{where} once the lumen closes"}
-
-
-def _intima(made: Made) -> Iterator[Term]:
-    areas, both = facet_areas(made.body, made.stencils.meeting, outer=False), "lower" in made.sides
-    dA = _some(areas, made.sides["upper"])
-    if both:  # a stress-free artery is its own mirror image
-        dA = 0.5 * (dA + _some(areas, made.sides["lower"]))
-    rule = made.stencils.meeting
-    here = Meeting(contact=made.contact, dA=dA, rule=rule, plane=jnp.zeros(()), both=both)
-    stencil = "meeting of both" if both else "meeting"
-    yield Term(name=INTIMA, region="upper inside", stencil=stencil, density=intima_energy, here=here)
-
-
-def _some(areas: Array, facets: np.ndarray) -> Array:
-    return areas if len(facets) == areas.shape[1] else areas[:, facets]
-
-
-KINDS = (
-    Kind(_wall_reasons, _wall),
-    Kind(_blood_reasons, _blood),
-    Kind(_jaw_reasons, _jaws, of_the_clamp=JAWS),
-    Kind(_intima_reasons, _intima, of_the_clamp=INTIMA),
-)
-
-OF_THE_CLAMP = tuple(kind.of_the_clamp for kind in KINDS if kind.of_the_clamp)
-"""terms that are only there while the jaws close"""
-
-
-def needed(scene: Scene, closing: bool = True, every_term: bool = False) -> dict[str, str]:
-    """Name of every term that a scene needs, and why.
-
-    closing: with those of the clamp; every_term: leave nothing of the clamp out because of the stop
-    """
-    kinds = [kind for kind in KINDS if closing or not kind.of_the_clamp]
-    found = {name: reason for kind in kinds for name, reason in kind.reasons(scene).items()}
-    if closing and every_term:
-        unexpected = "needed on the way to the stop, although it seemed not to be"
-        found = {**dict.fromkeys(OF_THE_CLAMP, unexpected), **found}
-    return found
-
-
-def all_terms(made: Made) -> tuple[Term | Volume, ...]:
-    """Every term that a scene of this kind can have, needed or not: derivatives see them all."""
-    return tuple(term for kind in KINDS for term in kind.terms(made))
-
-
 def build_potential(
     terms: Iterable[Term | Volume], regions: dict[str, Region], stencils: Stencils, layout: Layout
 ) -> Potential:
@@ -377,6 +218,7 @@ def build_potential(
         "contact": stencils.contact.position,
         "meeting": stencils.meeting.position,
         "meeting of both": stencils.meeting.of_two,
+        "nodes": np.ones((1, 1, 1)),
     }
     together: dict[tuple[str, str], list[Term | Volume]] = {}
     for term in terms:

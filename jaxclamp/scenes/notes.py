@@ -63,6 +63,10 @@ VOLUME_IN_BODY = 0.05
 """change of volume at a point of the artery in the body, where the three presets change by 0.3 to 1.8 %"""
 VOLUME_AT_POINTS = (0.8, 1.25)
 """volume ratios at a point of any state"""
+OUT_OF_PLACE = 0.25
+"""how far a clamp may move aside over the lumen's radius in the body"""
+GRIPPED = 0.02
+"""coefficient of friction that any wet wall has under a jaw"""
 CREASE = 1.0 / 2.4
 """ratio of the stretches along and across a free surface at which it creases, of a homogeneous neo-Hookean
 solid (Hong, Zhao & Suo, Appl Phys Lett 95 (2009) 111901)"""
@@ -102,6 +106,18 @@ def notes_of_states(history: list[dict[str, Any]]) -> list[str]:
             f"J is {least:.3g} to {most:.3g} at single points of the last state, off by more than 5 % in "
             f"{last['J_share_off']:.2g} of the wall: strain and stress are not resolved there. Peaks of "
             "stress at the fold depend on the mesh; force, lumen, and media under the jaw hardly do"
+        )
+    radius = 0.5 * float(body["lumen_height_mm"])
+    side, jaws = float(last["side_force_N"]), float(last["clamp_force_N"])
+    if side > GRIPPED * 2.0 * jaws:
+        said.append(
+            f"{side:.2g} N hold the artery sideways between jaws that press with {jaws:.2g} N each: without "
+            f"a coefficient of friction of {side / (2.0 * jaws):.2g} it would slide"
+        )
+    if abs(height := float(last["clamp_height_mm"])) > OUT_OF_PLACE * radius:
+        said.append(
+            f"the jaws, which are not alike, have bent the artery {abs(height):.2g} mm out of line, held by "
+            "its ends alone: what surrounds it in the body is not modelled"
         )
     if (ratio := float(last["fold_stretch_ratio"])) < CREASE:
         said.append(

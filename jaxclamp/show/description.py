@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxclamp.fem.symmetry import symmetry_of
 from jaxclamp.fem.tube import axial_fractions, build_tube, end_height
-from jaxclamp.potential.terms import needed
+from jaxclamp.potential.kinds import needed
 from jaxclamp.scenes.fitting import fitting_contact
 from jaxclamp.scenes.notes import notes
 from jaxclamp.scenes.scene import Scene

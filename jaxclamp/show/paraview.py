@@ -14,7 +14,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from jaxclamp.pictures.fields import jaw_height_shown, jaw_outline, layer_fields, whole
+from jaxclamp.pictures.fields import clamp_height, jaw_height_shown, jaw_outline, layer_fields, whole
 from jaxclamp.pictures.jaws import face_surface, is_drawn_out, jaw_gaps, touches
 from jaxclamp.pictures.tensors import with_fibres, with_tensors
 from jaxclamp.potential.model import Model
@@ -145,9 +145,8 @@ def jaw_mesh(result: Result, kept: Kept, widest: float, full: bool = True) -> An
             continue
         touch = of[-1] if side < 0 else of[0]
         if is_drawn_out(touch):
-            middle = float(np.sum(np.asarray(kept.state.q)[1:]))
             found, quads = _drawn_out(jaw_outline(touch.jaw, top), height, side, half_width)
-            found = found + [0.0, middle, 0.0]
+            found = found + [0.0, clamp_height(kept.model, kept.state), 0.0]
         else:
             found, quads = face_surface(gap, side, half_width, 1.2 * result.scene.clamp.half_extent(), top)
         points.append(found)

@@ -30,8 +30,9 @@ from jaxclamp.physics.placement import SQUARE
 from jaxclamp.potential.bodies import Body, brick_body, facet_areas
 from jaxclamp.potential.densities import Touch, jaw_energy, rigid
 from jaxclamp.potential.energy import State, energy, with_equilibrium_pressure
+from jaxclamp.potential.kinds import wall_terms
 from jaxclamp.potential.tangent import whole
-from jaxclamp.potential.terms import JAWS, Potential, Term, build_potential, wall_terms
+from jaxclamp.potential.terms import JAWS, Potential, Term, build_potential
 from jaxclamp.solve.descent import descend
 from jaxclamp.solve.linear_solvers import LinearSolver
 from jaxclamp.solve.newton import Equilibrium, Step, System, newton

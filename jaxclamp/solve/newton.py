@@ -209,6 +209,23 @@ def force_slope(lin: Linearisation, responses: np.ndarray) -> float:
     return -float(stiffness[0, 0] - stiffness[0, 1:] @ np.linalg.solve(others, stiffness[1:, 0]))
 
 
+def inertia(lin: Linearisation, responses: np.ndarray, negative: int | None) -> int | None:
+    """Negative eigenvalues of the tangent with the rigid coordinates that find their own equilibrium.
+
+    negative: those without; None if they are not known. With their Schur complement the whole has as many
+    more; of a Lagrange multiplier, which is linear, one belongs to its constraint (Gould, Math Program 32
+    (1985) 90).
+    """
+    touched = [i for i in range(1, lin.coupling.shape[1]) if np.any(lin.coupling[:, i])]
+    if negative is None or not touched:
+        return negative
+    schur = (lin.rigid_stiffness + lin.coupling.T @ responses[:, 1:])[np.ix_(touched, touched)]
+    if not np.all(np.isfinite(schur)):
+        return negative
+    multipliers = sum(lin.rigid_stiffness[i, i] == 0.0 for i in touched)
+    return negative + int(np.sum(np.linalg.eigvalsh(0.5 * (schur + schur.T)) < 0.0)) - int(multipliers)
+
+
 def newton(
     system: System,
     state: State,
@@ -305,7 +322,8 @@ def _factored(system: System, lin: Linearisation) -> tuple[int | None, np.ndarra
     """Negative eigenvalues of the tangent, and its responses (n_free, 1 + n_q). Raises NotConverged."""
     try:
         negative = system.solver.factor(np.asarray(lin.values))
-        return negative, system.solver.solve(_right_sides(lin))
+        responses = system.solver.solve(_right_sides(lin))
+        return inertia(lin, responses, negative), responses
     except Singular as failure:
         raise NotConverged(str(failure), residual_norm(lin), float(lin.J_min)) from failure
 

@@ -23,8 +23,8 @@ from jaxclamp.observe.figures import FIGURES, NODES_SUNK
 from jaxclamp.observe.measure import Measure, require_measure
 from jaxclamp.observe.measures import PEAK_SHARPNESS
 from jaxclamp.potential.energy import State
+from jaxclamp.potential.kinds import needed
 from jaxclamp.potential.model import Model
-from jaxclamp.potential.terms import needed
 from jaxclamp.scenes.files import scene_table
 from jaxclamp.scenes.notes import notes, notes_of_states
 from jaxclamp.scenes.scene import Scene

@@ -215,7 +215,9 @@ class Clamping:
             start = dataclasses.replace(in_body.state, q=self.rigid(touch))
             load = f"first contact, jaw height {touch:.3f} mm"
             equilibrium = self.solve_or_descend("clamping", start, self.step(Held(touch)), load)
-            if not np.any(equilibrium.lin.coupling) and move < self.outer_radius:  # teeth, a short reach
+            if (
+                not np.any(equilibrium.lin.coupling[:, 0]) and move < self.outer_radius
+            ):  # teeth, a short reach
                 move += FIRST_TOUCH * self.outer_radius
                 continue
             beyond = self.distance(equilibrium) if self.share(equilibrium.state) > 1.0 else 0.0

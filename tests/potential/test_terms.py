@@ -17,9 +17,10 @@ import jaxclamp as jc
 from jaxclamp.fem.tube import closed_positions
 from jaxclamp.potential import terms
 from jaxclamp.potential.energy import with_equilibrium_pressure
+from jaxclamp.potential.kinds import Kind, needed
 from jaxclamp.potential.model import Model, build_model, potential_of
 from jaxclamp.potential.tangent import cut, linearise, linearise_piece
-from jaxclamp.potential.terms import BLOOD, INTIMA, JAWS, KEPT_VOLUME, Kind, Term, needed
+from jaxclamp.potential.terms import BLOOD, INTIMA, JAWS, KEPT_VOLUME, Term
 from jaxclamp.show.description import describe
 from jaxclamp.solve.stages import Clamping
 from tube import MEDIA

@@ -68,8 +68,10 @@ def test_the_ends_of_ranges_are_not_far():
 
 
 def test_volumes_that_change_are_noted():
-    rest = {"J_share_off": 0.02, "fold_stretch_ratio": 0.5}
-    body, last = {"J_min": 1.001, "J_max": 1.003}, {"J_min": 0.85, "J_max": 1.13, **rest}
+    place = {"side_force_N": 0.0, "clamp_height_mm": 0.0, "clamp_force_N": 0.5}
+    rest = {"J_share_off": 0.02, "fold_stretch_ratio": 0.5, **place}
+    tube = {"lumen_height_mm": 5.0}
+    body, last = {"J_min": 1.001, "J_max": 1.003, **tube}, {"J_min": 0.85, "J_max": 1.13, **rest}
     assert notes_of_states([]) == []
     assert notes_of_states([body, last]) == []
     (said,) = notes_of_states([body, {"J_min": 0.7, "J_max": 1.26, **rest}])
@@ -78,7 +80,11 @@ def test_volumes_that_change_are_noted():
     )
     (said,) = notes_of_states([body, {**last, "fold_stretch_ratio": 0.4}])
     assert "surface creases below 0.417" in said
-    (said,) = notes_of_states([{"J_min": 0.99, "J_max": 1.06}, last])
+    (said,) = notes_of_states([body, {**last, "side_force_N": 0.1}])
+    assert "coefficient of friction of 0.1 " in said
+    (said,) = notes_of_states([body, {**last, "clamp_height_mm": 0.7}])
+    assert said.startswith("the jaws, which are not alike, have bent the artery 0.7 mm")
+    (said,) = notes_of_states([{"J_min": 0.99, "J_max": 1.06, **tube}, last])
     assert said.startswith("J is 0.99 to 1.06 in the body: the wall changes its volume")
 
 
