@@ -203,27 +203,24 @@ class Clamping:
             if path is None:
                 return equilibrium
             equilibrium = self.walk("clamping", equilibrium, path, self.tell_closing, reached)
-        raise self.error(
-            "clamping", equilibrium, NotConverged(f"{MAX_RESCUES} descents did not lead to the stop")
-        )
+        failed = NotConverged(f"{MAX_RESCUES} descents did not lead to the stop")
+        raise self.error("clamping", equilibrium, failed)
 
     def first_contact(self, in_body: Equilibrium) -> Equilibrium:
         """The jaw just on the artery, not beyond the stop."""
-        move = FIRST_TOUCH * self.outer_radius
+        stride = move = FIRST_TOUCH * self.outer_radius  # teeth and a short reach touch later than others
         while True:
             touch = self.outer_radius - move
             start = dataclasses.replace(in_body.state, q=self.rigid(touch))
             load = f"first contact, jaw height {touch:.3f} mm"
             equilibrium = self.solve_or_descend("clamping", start, self.step(Held(touch)), load)
-            if (
-                not np.any(equilibrium.lin.coupling[:, 0]) and move < self.outer_radius
-            ):  # teeth, a short reach
-                move += FIRST_TOUCH * self.outer_radius
-                continue
             beyond = self.distance(equilibrium) if self.share(equilibrium.state) > 1.0 else 0.0
+            if beyond == 0.0 and stride and not np.any(equilibrium.lin.coupling[:, 0]):
+                move, stride = move + stride, stride if move < self.outer_radius else 0.0
+                continue
             if beyond == 0.0 or move == 0.0:
                 return equilibrium
-            move = max(0.5 * (move - beyond), 0.0)
+            move, stride = max(0.5 * (move - beyond), 0.0), 0.0
 
     def next_path(self, now: Equilibrium) -> tuple[Path | None, Callable[[Equilibrium], bool]]:
         """The load path from here towards the stop, and where to leave it early; None at the stop."""

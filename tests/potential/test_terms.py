@@ -15,7 +15,7 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.fem.tube import closed_positions
-from jaxclamp.potential import terms
+from jaxclamp.potential import kinds
 from jaxclamp.potential.energy import with_equilibrium_pressure
 from jaxclamp.potential.kinds import Kind, needed
 from jaxclamp.potential.model import Model, build_model, potential_of
@@ -165,7 +165,7 @@ def bed_energy(y, q, here):
 
 
 def bed_terms(made):
-    dA = terms.facet_areas(made.body, made.stencils.contact, outer=True)
+    dA = kinds.facet_areas(made.body, made.stencils.contact, outer=True)
     here = {"stiffness": jnp.asarray(STIFFNESS), "dA": dA}
     yield Term(name=BED, region="upper outside", stencil="contact", density=bed_energy, here=here)
 
@@ -173,7 +173,7 @@ def bed_terms(made):
 @pytest.fixture
 def with_bed(monkeypatch):
     kind = Kind(lambda scene: {BED: "springs round the artery, for the test"}, bed_terms)
-    monkeypatch.setattr(terms, "KINDS", (*terms.KINDS, kind))
+    monkeypatch.setattr(kinds, "KINDS", (*kinds.KINDS, kind))
 
 
 def test_a_term_of_ones_own_is_one_entry(with_bed):
