@@ -190,7 +190,12 @@ class Measured(Face):
     def teeth(self) -> Teeth:
         """A sine along the artery, a tip in the middle."""
         return Teeth(
-            profile="sine", direction="along", rows=1, pitch=self.tooth_pitch, depth=self.tooth_depth
+            profile="sine",
+            direction="along",
+            middle="tip",
+            rows=1,
+            pitch=self.tooth_pitch,
+            depth=self.tooth_depth,
         )
 
     @property

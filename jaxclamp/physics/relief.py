@@ -24,8 +24,8 @@ USUAL_SHARPNESS = 4.0
 class Teeth:
     """A periodic height on a jaw's face, the tips on the smooth face, the grooves `depth` inside the jaw.
 
-    Given a `phase`, the mirror planes that it may break are not made use of; leave it out for a tip in the
-    middle and the smaller model.
+    Given a `phase`, the mirror planes that it may break are not made use of; leave it out for the smaller
+    model.
     """
 
     profile: str = static(choices=("sine", "wedge", "rows"))
@@ -37,8 +37,10 @@ class Teeth:
     """of the grooves"""
     direction: str = static("along", choices=("along", "across", "both"))
     """in which the height changes: along the artery, across it, or both (cross-serration)"""
+    middle: str = static("tip", choices=("tip", "groove"))
+    """what there is in the middle of the face; grooves of one jaw face tips of the other"""
     phase: Array | None = quantity("", -1.0, 1.0, default=None)
-    """how far the tips are beside the middle, in pitches; 0.5: a groove in the middle"""
+    """how far the teeth are beside that, in pitches"""
     tip_radius: Array | None = quantity("mm", 0.0, 1e2, open_lower=True, default=None)
     """of a wedge's tips; a quarter of what a sine of that pitch and depth has, if not given"""
     rows: int = static(1)
@@ -56,7 +58,7 @@ class Teeth:
 
     def height(self, x: Array | float, z: Array | float) -> Array:
         """Height of the face inside the jaw, mm, at places across and along the artery."""
-        shift = 0.0 if self.phase is None else self.phase
+        shift = (0.0 if self.phase is None else self.phase) + (0.5 if self.middle == "groove" else 0.0)
         share = {"sine": _sine, "wedge": self._wedge, "rows": self._rows}[self.profile]
         back = lambda s: share(jnp.asarray(s) / self.pitch - shift)  # noqa: E731
         if self.direction == "both":

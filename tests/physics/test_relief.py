@@ -12,8 +12,10 @@ from jaxclamp.physics.placement import SQUARE, Placement
 from jaxclamp.physics.relief import Crown, Teeth, _rounding
 
 
-def teeth(profile="sine", direction="along", pitch=1.0, depth=0.2, rows=2, **others):
-    return Teeth(profile=profile, direction=direction, pitch=pitch, depth=depth, rows=rows, **others)
+def teeth(profile="sine", direction="along", pitch=1.0, depth=0.2, rows=2, middle="tip", **others):
+    return Teeth(
+        middle=middle, profile=profile, direction=direction, pitch=pitch, depth=depth, rows=rows, **others
+    )
 
 
 ALL = [
@@ -41,6 +43,13 @@ def test_tips_have_the_radius_that_is_said(profile):
     wanted = {"wedge": 20.0, "sine": 2.0 * np.pi**2 * 0.2, "rows": 4.0 * np.pi**2 * 0.2}[profile]
     assert float(bend) == pytest.approx(wanted, rel=1e-9)
     assert float(one.curvatures()[0]) == pytest.approx(wanted, rel=1e-9)
+
+
+def test_a_groove_in_the_middle_is_half_a_pitch_aside():
+    groove, aside = teeth(middle="groove"), teeth(phase=jnp.asarray(0.5))
+    z = np.linspace(-1.0, 1.0, 50)
+    np.testing.assert_allclose(groove.height(0.0, z), aside.height(0.0, z), atol=1e-15)
+    assert (groove.planes, aside.planes) == ("xz", "x")
 
 
 @pytest.mark.parametrize("sharpness", [1.001, 1.5, 4.0, 100.0])
