@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -28,26 +29,31 @@ class Sheet(NamedTuple):
     """Cauchy stress, kPa"""
 
 
-def biaxial(material: Material, circumferential: Array, axial: Array) -> Sheet:
-    """At both stretches (n,), with no stress through the thickness."""
-    return Sheet(circumferential, axial, *over_radial(material, circumferential, axial))
+def flat_piece(
+    material: Material, circumferential_stretch: Array | None = None, axial_stretch: Array | None = None
+) -> Sheet:
+    """A piece at stretches (n,), with no stress through its thickness; free in the direction that is not
+    given.
+
+    Raises TypeError if neither is given.
+    """
+    if circumferential_stretch is not None and axial_stretch is not None:
+        stretches = circumferential_stretch, axial_stretch
+    elif axial_stretch is not None:
+        stretches = (
+            _across(lambda s: over_radial(material, s, axial_stretch)[0], axial_stretch),
+            axial_stretch,
+        )
+    elif circumferential_stretch is not None:
+        across = _across(
+            lambda s: over_radial(material, circumferential_stretch, s)[1], circumferential_stretch
+        )
+        stretches = circumferential_stretch, across
+    else:
+        raise TypeError("expected a circumferential stretch, an axial stretch, or both")
+    return Sheet(*stretches, *over_radial(material, *stretches))
 
 
-def uniaxial_axial(material: Material, axial: Array) -> Sheet:
-    """Pulled along the artery to stretches (n,), free around it."""
-    across = root(
-        lambda s: over_radial(material, s, axial)[0],
-        jnp.full_like(axial, NARROWEST),
-        jnp.full_like(axial, WIDEST),
-    )
-    return biaxial(material, across, axial)
-
-
-def uniaxial_circumferential(material: Material, circumferential: Array) -> Sheet:
-    """Pulled around the artery to stretches (n,), free along it."""
-    across = root(
-        lambda s: over_radial(material, circumferential, s)[1],
-        jnp.full_like(circumferential, NARROWEST),
-        jnp.full_like(circumferential, WIDEST),
-    )
-    return biaxial(material, circumferential, across)
+def _across(stress: Callable[[Array], Array], like: Array) -> Array:
+    """The stretch of the free direction, at which it has no stress."""
+    return root(stress, jnp.full_like(like, NARROWEST), jnp.full_like(like, WIDEST))

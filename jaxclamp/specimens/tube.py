@@ -104,3 +104,21 @@ def at_pressure(layers: Sequence[Layer], pressure: Array, axial_stretch: Array) 
     excess = lambda r: at_radius(layers, r, axial_stretch).pressure - pressure  # noqa: E731
     state = at_radius(layers, root(excess, NARROWEST * size, WIDEST * size), axial_stretch)
     return state._replace(pressure=jnp.broadcast_to(pressure, size.shape))
+
+
+def inflated_tube(layers: Sequence[Layer], axial_stretch: Array, **seen: Array) -> State:
+    """The tube at axial stretches and one of `pressure`, `inner_radius` and `outer_radius`, all (n,); mm,
+    kPa.
+
+    Raises TypeError for another quantity, or none or several of them.
+    """
+    if len(seen) != 1 or not seen.keys() <= {"pressure", "inner_radius", "outer_radius"}:
+        raise TypeError(
+            f"expected one of pressure, inner_radius and outer_radius, found {', '.join(seen) or 'none'}"
+        )
+    ((quantity, value),) = seen.items()
+    if quantity == "pressure":
+        return at_pressure(layers, value, axial_stretch)
+    if quantity == "outer_radius":
+        value = inner_from_outer(layers, value, axial_stretch)
+    return at_radius(layers, value, axial_stretch)

@@ -1,0 +1,234 @@
+"""How sure fitted numbers are: covariance, intervals by profile likelihood, and what the data do not tell."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy import stats
+
+from optimize.fit_search import Best, Search, moved
+
+LEVEL = 0.95
+"""of confidence intervals"""
+FARTHEST = 7.0
+"""|x| of a number that is as good as at the end of its range: a share of 0.001 from it"""
+CLOSE = 0.02
+"""how well the end of an interval is found: share of the rise of the sum of squares' root"""
+MOST_TRIALS = 12
+"""least squares for one end of an interval"""
+LONGEST = 2.0
+"""step of x along a profile where the quadratic one says nothing"""
+FACTOR = 5.0
+"""a positive number is identified if its interval's ends differ by less than this factor"""
+SHARE = 0.5
+"""an angle or a share is identified if its interval is less than this share of its range"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """Confidence in one number."""
+
+    standard_error: float
+    """of the quadratic approximation, unit of the scene file; infinite if there is none"""
+    lower: float
+    """unit of the scene file"""
+    upper: float
+    """unit of the scene file"""
+    bounded: tuple[bool, bool]
+    """False where the data set no end, and the interval ends with the range that was allowed"""
+    identified: bool
+    """True if the data tell the number"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Confidence:
+    """Confidence in all numbers."""
+
+    intervals: tuple[Interval, ...]
+    """one for each"""
+    covariance: np.ndarray
+    """(n, n), units of the scene file; not numbers where the data tell nothing"""
+    correlation: np.ndarray
+    """(n, n)"""
+    weak: tuple[str, ...]
+    """what the data cannot tell, in words"""
+    strong: tuple[str, ...]
+    """combinations that they tell although not each of their numbers, in words"""
+    independent: float
+    """how many residuals count: all of scatter, few of a pattern"""
+
+
+class Better(Exception):
+    """A profile came across a smaller sum of squares; `x` is where."""
+
+    def __init__(self, x: np.ndarray) -> None:
+        super().__init__(x)
+        self.x = x
+
+
+def confidence(search: Search, best: Best, patterns: list[int]) -> Confidence:
+    """Confidence about an optimum; raises `Better` if there is a lower one beside it."""
+    x = best.x
+    slopes = search.slopes(x, best.scatter)
+    residuals = search.residuals(x, best.scatter)
+    counted, independent = _independent(search, residuals, patterns)
+    independent = max(independent, x.size + 1.0)
+    movable = np.max(np.abs(slopes), axis=1) > 0.0
+    variance = max(float(np.sum(residuals[movable] ** 2)), 1e-20) / max(counted - x.size, 1)
+    variance *= max(counted / independent, 1.0)
+    spread = stats.t.ppf(0.5 + 0.5 * LEVEL, independent - x.size)
+    covariance = variance * np.linalg.pinv(slopes.T @ slopes, rcond=1e-14, hermitian=True)
+    rise = variance * spread**2
+    intervals = tuple(_interval(search, best, number, covariance, rise, spread) for number in range(x.size))
+    units = np.array([p.natural(v) * (float(p.value(v)) if p.relative else p.step)
+                      for p, v in zip(search.freedom.parameters, x, strict=True)])  # fmt: skip
+    in_units = covariance * np.outer(units, units)
+    sizes = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    weak, strong = _directions(search, x, slopes / np.sqrt(variance), spread, intervals)
+    return Confidence(
+        intervals, in_units, covariance / np.outer(sizes, sizes), weak, strong, float(independent)
+    )
+
+
+def _independent(search: Search, residuals: np.ndarray, patterns: list[int]) -> tuple[int, float]:
+    """How many residuals the fitted numbers move, and how many of them count as independent.
+
+    Scatter changes its sign every other time. Of a pattern, two values count for each run of one sign.
+    """
+    counted, independent, movable = 0, 0.0, moved(search, search.freedom.start())
+    for number, (_, begin, end) in enumerate(search.problem.runs):
+        if not movable[search.problem.group[begin]]:
+            continue
+        part = residuals[begin:end][search.order(number)]
+        runs = 1 + int(np.sum((part[1:] > 0.0) != (part[:-1] > 0.0)))
+        counted += part.size
+        independent += min(2.0 * runs, part.size) if number in patterns else part.size
+    return counted, independent
+
+
+def _interval(
+    search: Search, best: Best, number: int, covariance: np.ndarray, rise: float, spread: float
+) -> Interval:
+    parameter, x = search.freedom.parameters[number], best.x
+    reach = spread * float(np.sqrt(max(covariance[number, number], 0.0)))
+    ends, bounded = [], []
+    for sign in (-1.0, 1.0):
+        end = _end(search, best, number, sign, covariance, reach, rise)
+        bounded.append(end is not None)
+        limit = parameter.lower if sign < 0.0 else parameter.upper
+        ends.append(limit if end is None else float(parameter.value(end)))
+    lower, upper = ends
+    slope = parameter.natural(x[number]) * (
+        float(parameter.value(x[number])) if parameter.relative else parameter.step
+    )
+    error = float(np.sqrt(max(covariance[number, number], 0.0)) * slope)
+    narrow = (
+        upper < FACTOR * lower
+        if parameter.relative
+        else upper - lower < SHARE * (parameter.upper - parameter.lower)
+    )
+    return Interval(error, lower, upper, (bounded[0], bounded[1]), bool(narrow))
+
+
+def _end(
+    search: Search, best: Best, number: int, sign: float, covariance: np.ndarray, reach: float, rise: float
+) -> float | None:
+    """x where the least sum of squares with x held has risen by `rise`; None if it does not.
+
+    reach: where the quadratic approximation has it. The square root of the rise is nearly a straight line in
+    x, exactly one for a linear model.
+    """
+    variance = covariance[number, number]
+    along = covariance[:, number] / variance if variance > 0.0 else np.eye(best.x.size)[number]
+    along = np.clip(np.where(np.isfinite(along), along, 0.0), -3.0, 3.0)
+    along[number] = 1.0
+    inside: tuple[float, float] = (0.0, 0.0)
+    outside: tuple[float, float] | None = None
+    at, near = min(reach, LONGEST) if 0.0 < reach < np.inf else LONGEST, best.x
+    for _ in range(MOST_TRIALS):
+        beyond = abs(best.x[number] + sign * at) > FARTHEST and outside is None
+        if beyond:
+            at = max(FARTHEST - sign * best.x[number], 0.0)
+        start = near + (best.x[number] + sign * at - near[number]) * along
+        found, squares = search.minimise(np.clip(start, -2 * FARTHEST, 2 * FARTHEST), best.scatter, number)
+        if squares < best.squares - 0.1 * rise:
+            raise Better(found)
+        height = float(np.sqrt(max(squares - best.squares, 0.0) / rise))
+        if abs(height - 1.0) < CLOSE:
+            return float(best.x[number] + sign * at)
+        if height < 1.0:
+            if beyond:
+                return None
+            inside, near = (at, height), found
+        else:
+            outside = (at, height)
+        if outside is None:
+            at = at * min(max(1.05 / max(height, 1e-3), 1.2), 3.0)
+        else:
+            share = (1.0 - inside[1]) / (outside[1] - inside[1])
+            at = inside[0] + (outside[0] - inside[0]) * min(max(share, 0.1), 0.9)
+    return float(best.x[number] + sign * at)
+
+
+# ------------------------------------------------------------------------------------- in words
+
+UNTOLD, TOLD = 0.7, 0.2
+"""natural size (logarithm of a factor) of a combination's confidence, above which it is untold, below which
+told"""
+TAKES_PART = 0.2
+"""share of the largest item of a combination that an item has to have to be named"""
+
+
+def _directions(
+    search: Search, x: np.ndarray, slopes: np.ndarray, spread: float, intervals: tuple[Interval, ...]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Eigenvectors of the information matrix in natural sizes, in words: untold ones, told ones."""
+    freedom = search.freedom
+    sizes = np.array([p.natural(v) for p, v in zip(freedom.parameters, x, strict=True)])
+    natural = slopes / np.where(np.abs(sizes) > 1e-12, sizes, 1e-12)
+    information, vectors = np.linalg.eigh(natural.T @ natural)
+    weak, strong = [], []
+    for value, vector in zip(information, vectors.T, strict=True):
+        uncertain = spread / np.sqrt(max(value, 1e-300))
+        parts = np.flatnonzero(np.abs(vector) >= TAKES_PART * np.max(np.abs(vector)))
+        names = [freedom.name(int(i)) for i in parts]
+        if uncertain > UNTOLD:
+            weak.append(_untold(search, parts, vector, names))
+        elif uncertain < TOLD and len(parts) > 1 and any(not intervals[i].identified for i in parts):
+            strong.append(_told(search, parts, vector, uncertain))
+    return tuple(weak), tuple(strong)
+
+
+def _untold(search: Search, parts: np.ndarray, vector: np.ndarray, names: list[str]) -> str:
+    if len(parts) == 1:
+        return f"the data do not tell {names[0]}"
+    largest = parts[np.argmax(np.abs(vector[parts]))]
+    scale = (
+        np.log(2.0) / vector[largest]
+        if search.freedom.parameters[largest].relative
+        else 0.5 / vector[largest]
+    )
+    moves = []
+    for i, name in zip(parts, names, strict=True):
+        parameter, change = search.freedom.parameters[i], scale * vector[i]
+        if parameter.relative:
+            moves.append(f"{name} times {np.exp(change):.2g}")
+        else:
+            moves.append(f"{name} {change * parameter.step:+.2g}{' deg' if parameter.unit == 'deg' else ''}")
+    return f"the data tell {_listed(names)} only together: {_listed(moves)} fits about as well"
+
+
+def _told(search: Search, parts: np.ndarray, vector: np.ndarray, uncertain: float) -> str:
+    relative = [i for i in parts if search.freedom.parameters[i].relative]
+    largest = parts[np.argmax(np.abs(vector[parts]))]
+    scale = vector[largest]
+    if len(relative) < len(parts):
+        names = [search.freedom.name(int(i)) for i in parts]
+        return f"the data tell one combination of {_listed(names)} well"
+    powers = " ".join(f"({search.freedom.name(int(i))})^{vector[i] / scale:.2g}" for i in parts)
+    return f"the data tell {powers} to {np.expm1(uncertain / abs(scale)):.1%}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
