@@ -141,26 +141,31 @@ def fit(
     free = freedom(scene, asked.free, asked.fixed, asked.ties)
     if asked.given not in GIVENS:
         raise SceneError(f"--given {shortened(asked.given)}: expected {' or '.join(GIVENS)}")
-    tell = progress or (lambda event: None)
     together = problem([experiment(data, scene, asked.given) for data in files])
     _check_counts(together, free, asked.starts)
-    search = Search(together, free)
-    best = search.best(asked.starts, asked.seed, tell)
+    return solved(Search(together, free), asked.starts, asked.seed, progress)
+
+
+def solved(
+    search: Search, starts: int, seed: int = 0, progress: Callable[[Progress], Any] | None = None
+) -> Fit:
+    """The fit of a problem that is compiled already."""
+    tell = progress or (lambda event: None)
+    best = search.best(starts, seed, tell)
     for _ in range(AGAIN):
         patterns = patterned(search, best.x, best.scatter)
         tell(Progress("confidence", 0.0, "profiles of the sum of squares"))
         try:
             sure = confidence(search, best, patterns)
-            break
         except Better as better:
             x, squares = search.minimise(better.x, best.scatter)
-            best = dataclasses.replace(best, x=x, squares=squares, agreeing=1)
-    else:
-        raise SceneError(
-            "the sum of squares has too many optima for a fit: expected more data, or fewer free numbers"
-        )
-    tell(Progress("confidence", 1.0, ""))
-    return _fitted(search, best, sure, patterns)
+            others = (*best.others, (best.x, best.squares))
+            best = dataclasses.replace(best, x=x, squares=squares, others=others, agreeing=1)
+            continue
+        tell(Progress("confidence", 1.0, ""))
+        return _fitted(search, best, sure, patterns)
+    said = "the sum of squares has too many optima"
+    raise SceneError(f"{said}: expected more data, more starts (--starts), or fewer free numbers (--free)")
 
 
 def _check_counts(together: Problem, free: Freedom, starts: int) -> None:
@@ -232,7 +237,8 @@ def _notes(search: Search, best: Best, sure: Confidence, patterns: list[int]) ->
             "confidence, which does not cover what the law itself gets wrong"
         )
     said += [f"{text[0].upper()}{text[1:]}" for text in sure.weak]
-    if best.agreeing < max(2, best.starts // 4) and best.starts > 1:
+    said += [_rival(search, best.x, other) for other in sure.rivals]
+    if best.agreeing < max(2, best.starts // 4) and best.starts > 1 and not sure.rivals:
         said.append(
             f"only {best.agreeing} of {best.starts} starts ended at this optimum: try more (--starts)"
         )
@@ -243,6 +249,17 @@ def _notes(search: Search, best: Best, sure: Confidence, patterns: list[int]) ->
     for each in search.problem.experiments:
         said += [f"{each.data.source}: {name} was not used" for name in (*each.unused, *each.data.ignored)]
     return said
+
+
+def _rival(search: Search, x: np.ndarray, other: np.ndarray) -> str:
+    """Where another optimum is, by the numbers that differ most."""
+    numbers = sorted(range(x.size), key=lambda i: -abs(x[i] - other[i]))[:4]
+    parts = [
+        f"{search.freedom.name(i)} {float(p.value(other[i])):.3g} {p.unit}".strip()
+        for i, p in enumerate(search.freedom.parameters)
+        if i in numbers
+    ]
+    return f"another optimum fits about as well, which the confidence spans: {', '.join(parts)}"
 
 
 def fit_files(

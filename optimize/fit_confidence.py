@@ -57,6 +57,8 @@ class Confidence:
     """combinations that they tell although not each of their numbers, in words"""
     independent: float
     """how many residuals count: all of scatter, few of a pattern"""
+    rivals: tuple[np.ndarray, ...] = ()
+    """x of other optima that fit about as well; intervals span them"""
 
 
 class Better(Exception):
@@ -78,16 +80,18 @@ def confidence(search: Search, best: Best, patterns: list[int]) -> Confidence:
     variance = max(float(np.sum(residuals[movable] ** 2)), 1e-20) / max(counted - x.size, 1)
     variance *= max(counted / independent, 1.0)
     spread = stats.t.ppf(0.5 + 0.5 * LEVEL, independent - x.size)
-    covariance = variance * np.linalg.pinv(slopes.T @ slopes, rcond=1e-14, hermitian=True)
+    covariance = _covariance(slopes, variance)
     rise = variance * spread**2
-    intervals = tuple(_interval(search, best, number, covariance, rise, spread) for number in range(x.size))
-    units = np.array([p.natural(v) * (float(p.value(v)) if p.relative else p.step)
-                      for p, v in zip(search.freedom.parameters, x, strict=True)])  # fmt: skip
+    rivals = tuple(other for other, squares in best.others if squares <= best.squares + rise)
+    optima = [(x, covariance)]
+    optima += [(other, _covariance(search.slopes(other, best.scatter), variance)) for other in rivals]
+    intervals = tuple(_interval(search, best, number, optima, rise, spread) for number in range(x.size))
+    units = np.array([p.slope(v) for p, v in zip(search.freedom.parameters, x, strict=True)])
     in_units = covariance * np.outer(units, units)
     sizes = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     weak, strong = _directions(search, x, slopes / np.sqrt(variance), spread, intervals)
     return Confidence(
-        intervals, in_units, covariance / np.outer(sizes, sizes), weak, strong, float(independent)
+        intervals, in_units, covariance / np.outer(sizes, sizes), weak, strong, float(independent), rivals
     )
 
 
@@ -107,56 +111,65 @@ def _independent(search: Search, residuals: np.ndarray, patterns: list[int]) -> 
     return counted, independent
 
 
+def _covariance(slopes: np.ndarray, variance: float) -> np.ndarray:
+    """Of x, in the quadratic approximation."""
+    found: np.ndarray = variance * np.linalg.pinv(slopes.T @ slopes, rcond=1e-14, hermitian=True)
+    return found
+
+
+Optimum = tuple[np.ndarray, np.ndarray]
+"""x, and its covariance in the quadratic approximation"""
+
+
 def _interval(
-    search: Search, best: Best, number: int, covariance: np.ndarray, rise: float, spread: float
+    search: Search, best: Best, number: int, optima: list[Optimum], rise: float, spread: float
 ) -> Interval:
-    parameter, x = search.freedom.parameters[number], best.x
-    reach = spread * float(np.sqrt(max(covariance[number, number], 0.0)))
-    ends, bounded = [], []
-    for sign in (-1.0, 1.0):
-        end = _end(search, best, number, sign, covariance, reach, rise)
-        bounded.append(end is not None)
-        limit = parameter.lower if sign < 0.0 else parameter.upper
-        ends.append(limit if end is None else float(parameter.value(end)))
-    lower, upper = ends
-    slope = parameter.natural(x[number]) * (
-        float(parameter.value(x[number])) if parameter.relative else parameter.step
+    """From the lowest to the highest end of the profiles about all optima that fit about as well."""
+    parameter, (x, covariance) = search.freedom.parameters[number], optima[0]
+    lower, upper = (
+        [_end(search, best, number, sign, optimum, rise, spread) for optimum in optima]
+        for sign in (-1.0, 1.0)
     )
-    error = float(np.sqrt(max(covariance[number, number], 0.0)) * slope)
+    bounded = None not in lower, None not in upper
+    low = float(parameter.value(min(e for e in lower if e is not None))) if bounded[0] else parameter.lower
+    high = float(parameter.value(max(e for e in upper if e is not None))) if bounded[1] else parameter.upper
+    error = float(np.sqrt(max(covariance[number, number], 0.0))) * parameter.slope(x[number])
     narrow = (
-        upper < FACTOR * lower
+        high < FACTOR * low
         if parameter.relative
-        else upper - lower < SHARE * (parameter.upper - parameter.lower)
+        else high - low < SHARE * (parameter.upper - parameter.lower)
     )
-    return Interval(error, lower, upper, (bounded[0], bounded[1]), bool(narrow))
+    return Interval(error, low, high, bounded, bool(narrow))
 
 
 def _end(
-    search: Search, best: Best, number: int, sign: float, covariance: np.ndarray, reach: float, rise: float
+    search: Search, best: Best, number: int, sign: float, optimum: Optimum, rise: float, spread: float
 ) -> float | None:
-    """x where the least sum of squares with x held has risen by `rise`; None if it does not.
+    """x where the least sum of squares with x held is `rise` above the least of all; None if it never is.
 
-    reach: where the quadratic approximation has it. The square root of the rise is nearly a straight line in
-    x, exactly one for a linear model.
+    The square root of the rise is nearly a straight line in x, exactly one for a linear model.
     """
+    x, covariance = optimum
     variance = covariance[number, number]
-    along = covariance[:, number] / variance if variance > 0.0 else np.eye(best.x.size)[number]
+    along = covariance[:, number] / variance if variance > 0.0 else np.zeros(x.size)
     along = np.clip(np.where(np.isfinite(along), along, 0.0), -3.0, 3.0)
     along[number] = 1.0
+    reach = spread * float(np.sqrt(max(variance, 0.0)))
+    at = min(reach, LONGEST) if reach > 0.0 else LONGEST
     inside: tuple[float, float] = (0.0, 0.0)
     outside: tuple[float, float] | None = None
-    at, near = min(reach, LONGEST) if 0.0 < reach < np.inf else LONGEST, best.x
+    near = x
     for _ in range(MOST_TRIALS):
-        beyond = abs(best.x[number] + sign * at) > FARTHEST and outside is None
+        beyond = abs(x[number] + sign * at) > FARTHEST and outside is None
         if beyond:
-            at = max(FARTHEST - sign * best.x[number], 0.0)
-        start = near + (best.x[number] + sign * at - near[number]) * along
+            at = max(FARTHEST - sign * x[number], 0.0)
+        start = near + (x[number] + sign * at - near[number]) * along
         found, squares = search.minimise(np.clip(start, -2 * FARTHEST, 2 * FARTHEST), best.scatter, number)
         if squares < best.squares - 0.1 * rise:
             raise Better(found)
         height = float(np.sqrt(max(squares - best.squares, 0.0) / rise))
         if abs(height - 1.0) < CLOSE:
-            return float(best.x[number] + sign * at)
+            break
         if height < 1.0:
             if beyond:
                 return None
@@ -168,7 +181,7 @@ def _end(
         else:
             share = (1.0 - inside[1]) / (outside[1] - inside[1])
             at = inside[0] + (outside[0] - inside[0]) * min(max(share, 0.1), 0.9)
-    return float(best.x[number] + sign * at)
+    return float(x[number] + sign * at)
 
 
 # ------------------------------------------------------------------------------------- in words

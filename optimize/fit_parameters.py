@@ -62,10 +62,13 @@ class Parameter:
     def _ends(self) -> tuple[float, float]:
         return (math.log(self.lower), math.log(self.upper)) if self.relative else (self.lower, self.upper)
 
+    def slope(self, x: float) -> float:
+        """d(value)/dx, unit of the scene file."""
+        return float(jax.grad(lambda x: self.value(x))(jnp.asarray(x, float)))
+
     def natural(self, x: float) -> float:
         """d(natural size)/dx; the natural size is the logarithm of what is relative, else value / `step`."""
-        slope = float(jax.grad(lambda x: self.value(x))(jnp.asarray(x, float)))
-        return slope / (float(self.value(x)) if self.relative else self.step)
+        return self.slope(x) / (float(self.value(x)) if self.relative else self.step)
 
     @property
     def step(self) -> float:

@@ -28,8 +28,10 @@ FULL_SCALE = 0.01
 """share of the largest value of a column that is its scatter where nothing better is known"""
 MOST_ROUNDS, SETTLED = 20, 0.01
 """rounds of weighing columns anew; change of a scatter that ends them"""
-SAME = 0.01
-"""sums of squares that differ by less than this share of the least are of one optimum"""
+DISTINCT = 0.3
+"""x of optima that are told apart differ by more than this, a thirteenth of the range in its middle"""
+MUCH_WORSE = 2.0
+"""sums of squares that are this many times the least are not looked at again"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,10 +46,12 @@ class Best:
     """sum of squares of residuals over their standard deviations"""
     weighed_by: str
     """how columns weigh beside each other, in words"""
-    starts: int
+    starts: int = 1
     """how many were tried"""
-    agreeing: int
+    agreeing: int = 1
     """how many of them ended there"""
+    others: tuple[tuple[np.ndarray, float], ...] = ()
+    """other optima that starts ended at: x, and the sum of squares with the same weights"""
 
 
 class Search:
@@ -119,25 +123,47 @@ class Search:
         for number, guess in enumerate(guesses):
             tell(Progress("fitting", number / starts, f"start {number + 1} of {starts}"))
             ends.append(self.minimise(guess, first))
-        x, squares = min(ends, key=lambda end: end[1])
-        agreeing = sum(end[1] <= (1.0 + SAME) * squares + 1e-9 for end in ends)
-        if stated:
-            return Best(x, first, squares, "the standard deviations of the files", starts, agreeing)
-        if np.unique(self.problem.group).size > 1:
-            settled, scatter, squares_there = self._settled(x)
-            if not patterned(self, settled, scatter):
-                return Best(settled, scatter, squares_there, "the scatter of each column", starts, agreeing)
-        return Best(x, first, squares, "their full scale", starts, agreeing)
+        found = self._weighed(ends, first, stated)
+        agreeing = sum(_alike(found.x, self.minimise(end[0], found.scatter)[0]) for end in ends)
+        return dataclasses.replace(found, starts=starts, agreeing=agreeing)
 
-    def _settled(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """The optimum near x with columns weighed by their own scatter about it; the scatter; the squares."""
+    def _weighed(self, ends: list[tuple[np.ndarray, float]], first: np.ndarray, stated: bool) -> Best:
+        """The least of what starts ended at, with the columns' final weights; and the others."""
+        x, squares = min(ends, key=lambda end: end[1])
+        if stated:
+            return self._among(Best(x, first, squares, "the standard deviations of the files"), ends)
+        if np.unique(self.problem.group).size > 1:
+            settled = self._among(self._settled(x), ends)
+            if not patterned(self, settled.x, settled.scatter):
+                return settled
+        return self._among(Best(x, first, squares, "their full scale"), ends)
+
+    def _settled(self, x: np.ndarray) -> Best:
+        """The optimum near x with columns weighed by their own scatter about it."""
         scatter, squares = self.scatter(x), 0.0
         for _ in range(MOST_ROUNDS):
             x, squares = self.minimise(x, scatter)
             before, scatter = scatter, self.scatter(x)
             if np.max(np.abs(scatter / before - 1.0)) < SETTLED:
                 break
-        return x, before, squares
+        return Best(x, before, squares, "the scatter of each column")
+
+    def _among(self, best: Best, ends: list[tuple[np.ndarray, float]]) -> Best:
+        """The least of all ends with the weights of one of them, and the others that differ."""
+        optima = [(best.x, best.squares)]
+        for end, squares in ends:
+            if squares > MUCH_WORSE * min(ends, key=lambda end: end[1])[1]:
+                continue
+            found = self.minimise(end, best.scatter)
+            if not any(_alike(found[0], other) for other, _ in optima):
+                optima.append(found)
+        (x, squares), *others = sorted(optima, key=lambda found: found[1])
+        return dataclasses.replace(best, x=x, squares=squares, others=tuple(others))
+
+
+def _alike(a: np.ndarray, b: np.ndarray) -> bool:
+    """True if two vectors are of one optimum, or both are where the data tell nothing."""
+    return bool(np.max(np.abs(a - b)) < DISTINCT)
 
 
 def moved(search: Search, x: np.ndarray) -> np.ndarray:
