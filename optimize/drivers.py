@@ -13,7 +13,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
@@ -163,53 +162,34 @@ METHODS: dict[str, Method] = {
 
 
 MOST_STEPS_OF_A_FIT, LARGEST_RESIDUAL = 200, 1e8
-"""steps of Levenberg and Marquardt; residuals, over their standard deviations, are cut there"""
+"""residuals that one least squares asks for; residuals, over their standard deviations, are cut there"""
 
 
 def levenberg_marquardt(
-    residuals: Callable[[Any, Any], Any],
-) -> Callable[[np.ndarray, np.ndarray, Any], tuple[np.ndarray, float]]:
-    """Least squares by Levenberg's and Marquardt's method (jaxopt), compiled once for all starts.
+    values: Callable[[np.ndarray], Any], slopes: Callable[[np.ndarray], Any], start: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Least squares by Levenberg's and Marquardt's method (SciPy's MINPACK): x, and the sum of squares there.
 
-    residuals: a JAX function of a vector x (n,) and of anything else; returns (m,). The driver takes a start,
-    a mask (n,) of the items of x that move (1.0) or stay (0.0), and the rest; it returns x and the sum of
-    squares there. jaxopt multiplies rejected trial states by 0 instead of choosing, so that residuals and
-    slopes that are not finite would spoil the accepted ones: large ones and 0 stand for them.
+    values, slopes: residuals (m,) at x (n,), and their derivatives (m, n); where they are not finite large
+    ones and 0 stand for them, so that steps go back. jaxopt's method was measured and left: on the host its
+    own arithmetic took 16 ms a step, several times the residuals'; in one program it compiled them and their
+    derivatives several times over, and it multiplies rejected states by 0 instead of choosing, so that one
+    infinite residual spoils all.
     """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*jaxopt.*", category=DeprecationWarning)
-        import jaxopt
 
-    @jax.custom_jvp
-    def finite(x: Any, mask: Any, rest: Any) -> Any:
-        found = residuals(x, rest)
-        cut = jnp.clip(found, -LARGEST_RESIDUAL, LARGEST_RESIDUAL)
-        return jnp.where(jnp.isfinite(found), cut, LARGEST_RESIDUAL)
+    def finite(x: np.ndarray) -> np.ndarray:
+        found = np.nan_to_num(np.asarray(values(x)), nan=LARGEST_RESIDUAL)
+        return np.clip(found, -LARGEST_RESIDUAL, LARGEST_RESIDUAL)
 
-    @finite.defjvp
-    def _(at: Any, along: Any) -> Any:
-        x, mask, rest = at
-        slope = jax.jvp(lambda x: residuals(x, rest), (x,), (along[0] * mask,))[1]
-        return finite(x, mask, rest), jnp.where(jnp.isfinite(slope), slope, 0.0)
-
-    solver = jaxopt.LevenbergMarquardt(
-        residual_fun=finite,
-        materialize_jac=True,
-        solver="cholesky",
-        damping_parameter=1e-3,
-        maxiter=MOST_STEPS_OF_A_FIT,
-        tol=1e-4,
-        implicit_diff=False,
+    found = scipy.optimize.least_squares(
+        finite,
+        start,
+        jac=lambda x: np.nan_to_num(np.asarray(slopes(x)), nan=0.0, posinf=0.0, neginf=0.0),
+        method="lm",
+        x_scale="jac",
+        ftol=1e-9,
+        xtol=1e-7,
+        gtol=1e-10,
+        max_nfev=MOST_STEPS_OF_A_FIT,
     )
-
-    @jax.jit
-    def run(x: Any, mask: Any, rest: Any) -> Any:
-        found, state = solver.run(x, mask, rest)
-        return found, 2.0 * state.value, state.iter_num
-
-    def drive(start: np.ndarray, mask: np.ndarray, rest: Any) -> tuple[np.ndarray, float]:
-        with jax.numpy_dtype_promotion("standard"):  # jaxopt multiplies by truth values
-            x, value, _ = run(jnp.asarray(start), jnp.asarray(mask), rest)
-        return np.asarray(x), float(value)
-
-    return drive
+    return found.x, 2.0 * float(found.cost)

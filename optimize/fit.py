@@ -181,7 +181,7 @@ def _check_counts(together: Problem, free: Freedom, starts: int) -> None:
 
 def _fitted(search: Search, best: Best, sure: Confidence, patterns: list[int]) -> Fit:
     together, free = search.problem, search.freedom
-    predicted = np.asarray(search.predicted(jnp.asarray(best.x)))
+    predicted = search.predicted(best.x)
     scene = free.scene
     for path in [p.path for p in free.parameters] + [tie.left for tie in free.ties]:
         scene = replace(scene, path, float(get(free.scene_at(jnp.asarray(best.x)), path)))

@@ -181,27 +181,35 @@ def _place(scene: Scene, address: str) -> Place:
     return place
 
 
-_TIE = re.compile(r"([^=*/]+)=(?:([^=*/]+)\*)?([^=*/]+?)(?:([*/])([^=*/]+))?")
+_TIE = re.compile(r"([^=*/]+)=([^=*/]+)(?:([*/])([^=*/]+))?")
 
 
 def _tie(scene: Scene, text: str) -> Tie:
     """Read "left = right", with "* number", "/ number" or "number *". Raises SceneError."""
     match = _TIE.fullmatch(text.strip())
-    if match is None or (match[2] and match[4]):
+    if match is None:
         raise SceneError(f"--tie {text!r}: expected a tie such as adventitia.c = media.c / 10")
-    left, right = _place(scene, match[1]), _place(scene, match[3])
+    first, mark, last = match[2].strip(), match[3], (match[4] or "1").strip()
+    if mark == "*" and _number(last) is None:
+        first, last = last, first
+    factor = _number(last)
+    left, right = _place(scene, match[1]), _place(scene, first)
     if left.range.unit != right.range.unit:
         raise SceneError(f"--tie {text!r}: expected numbers of one unit, found {left.key} and {right.key}")
     if left.path == right.path:
         raise SceneError(f"--tie {text!r}: expected two different numbers")
-    try:
-        factor = float(match[2] or match[5] or 1.0)
-        factor = 1.0 / factor if match[4] == "/" else factor
-    except (ValueError, ZeroDivisionError):
-        factor = math.nan
-    if not math.isfinite(factor):
+    if not factor:
         raise SceneError(f"--tie {text!r}: expected a number other than 0 as the factor")
+    factor = 1.0 / factor if mark == "/" else factor
     return Tie(left.path, right.path, factor)
+
+
+def _number(text: str) -> float | None:
+    try:
+        found = float(text)
+    except ValueError:
+        return None
+    return found if math.isfinite(found) else None
 
 
 def _parameter(place: Place) -> Parameter:

@@ -59,10 +59,7 @@ class Search:
 
     def __init__(self, problem: Problem, freedom: Freedom) -> None:
         self.problem, self.freedom = problem, freedom
-        self._minimise = levenberg_marquardt(self._residuals)
-        self._slopes = jax.jit(jax.jacfwd(self._residuals))
-        self._values = jax.jit(self._residuals)
-        self.predicted: Callable[[Any], Any] = jax.jit(lambda x: problem.predicted(freedom.scene_at(x)))
+        self._values, self._slopes = jax.jit(self._residuals), jax.jit(jax.jacfwd(self._residuals))
 
     def _residuals(self, x: Any, rest: Any) -> Any:
         deviations, measured = rest
@@ -75,6 +72,11 @@ class Search:
     def residuals(self, x: np.ndarray, scatter: np.ndarray) -> np.ndarray:
         """Predicted less measured, over the standard deviation, (n,)."""
         return np.asarray(self._values(jnp.asarray(x), self._rest(scatter)))
+
+    def predicted(self, x: np.ndarray) -> np.ndarray:
+        """What is compared, predicted, (n,), internal units."""
+        ones = np.ones(len(self.problem.names))
+        return self.problem.measured + self.residuals(x, ones) * self.problem.weights
 
     def slopes(self, x: np.ndarray, scatter: np.ndarray) -> np.ndarray:
         """Derivatives of the residuals by x, (n, n_parameters)."""
@@ -90,10 +92,22 @@ class Search:
         self, x: np.ndarray, scatter: np.ndarray, held: int | None = None
     ) -> tuple[np.ndarray, float]:
         """x of least squares from a start, with one parameter held, and the sum of squares."""
-        mask = np.ones(x.size)
-        if held is not None:
-            mask[held] = 0.0
-        return self._minimise(x, mask, self._rest(scatter))
+        free = np.arange(x.size) != (-1 if held is None else held)
+        rest = self._rest(scatter)
+
+        def whole(part: np.ndarray) -> np.ndarray:
+            filled = np.array(x, dtype=float)
+            filled[free] = part
+            return filled
+
+        if not free.any():
+            return x, float(np.sum(self.residuals(x, scatter) ** 2))
+        found, squares = levenberg_marquardt(
+            lambda part: self._values(whole(part), rest),
+            lambda part: np.asarray(self._slopes(whole(part), rest))[:, free],
+            np.asarray(x)[free],
+        )
+        return whole(found), squares
 
     def scatter(self, x: np.ndarray) -> np.ndarray:
         """Scatter of each column about the prediction, (names,), as in `Best`."""
