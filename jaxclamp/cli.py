@@ -287,7 +287,7 @@ def fit(
     given: Annotated[
         str, typer.Option("--given", metavar="radius|pressure", help="Compare a tube at this.")
     ] = "radius",
-    starts: Annotated[int, typer.Option("--starts", metavar="N", help="From how many starts.")] = 5,
+    starts: Annotated[int, typer.Option("--starts", metavar="N", help="From how many starts.")] = 20,
     seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of random starts.")] = 0,
     out: Annotated[
         Path | None,

@@ -186,7 +186,7 @@ def levenberg_marquardt(
         start,
         jac=lambda x: np.nan_to_num(np.asarray(slopes(x)), nan=0.0, posinf=0.0, neginf=0.0),
         method="lm",
-        x_scale="jac",
+        x_scale=1.0,
         ftol=1e-9,
         xtol=1e-7,
         gtol=1e-10,

@@ -121,7 +121,7 @@ class Asked:
     """as "HEADER=NAME", for columns to be read by another name"""
     given: str = "radius"
     """what a tube is seen at: "radius", or "pressure" instead"""
-    starts: int = 5
+    starts: int = 20
     """how many"""
     seed: int = 0
     """of the random starts"""
