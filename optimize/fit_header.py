@@ -86,9 +86,11 @@ class Header:
 
 
 def understood(word: str) -> Header | str | None:
-    """What a header says; None if it names no quantity known here, a sentence if its unit is wrong.
+    """What a header says; None if it names nothing known here, a sentence if its unit is wrong.
 
-    "pressure (mmHg)" is read as "pressure_mmHg". Names are known in either case, units as they are written.
+    A word behind the unit, as in "outer_diameter_um_control", tells columns of one kind apart, one of which
+    the user has to name. "pressure (mmHg)" is read as "pressure_mmHg". Names are known in either case, units
+    as they are written.
     """
     plain = re.sub(r"\s*[(\[]\s*([^)\]]*?)\s*[)\]]", r"_\1", word.strip()).replace(" ", "_").rstrip("_")
     deviation = plain.lower().endswith("_sd")
@@ -103,6 +105,8 @@ def understood(word: str) -> Header | str | None:
     known = UNITS[meaning.dimension]
     if unit in known:
         return Header(meaning, unit, deviation)
+    if any(each and unit.startswith(f"{each}_") for each in known):  # a group of animals, a side
+        return None
     return _wrong_unit(unit, meaning, list(known))
 
 
@@ -119,6 +123,9 @@ def _wrong_unit(unit: str, meaning: Meaning, known: list[str]) -> str:
 
 
 def meant(word: str) -> str:
-    """What an unknown header may have meant, '; did you mean X?', or nothing."""
+    """What an unknown header may have meant, or nothing; to be set behind it."""
+    shorter = word.rpartition("_")[0]
+    if isinstance(understood(shorter), Header):
+        return f" (to read it: --column '{word}={shorter}')"
     known = [*MEANINGS, LAYER]
     return f"; {did_you_mean(word, known)}" if nearest(word, known) else ""

@@ -28,8 +28,8 @@ FULL_SCALE = 0.01
 """share of the largest value of a column that is its scatter where nothing better is known"""
 MOST_ROUNDS, SETTLED = 20, 0.01
 """rounds of weighing columns anew; change of a scatter that ends them"""
-DISTINCT = 0.3
-"""x of optima that are told apart differ by more than this, a thirteenth of the range in its middle"""
+DISTINCT = 0.02
+"""share of the range of a number by which optima that are told apart differ at least"""
 MUCH_WORSE = 2.0
 """sums of squares that are this many times the least are not looked at again"""
 
@@ -176,8 +176,9 @@ class Search:
 
 
 def _alike(a: np.ndarray, b: np.ndarray) -> bool:
-    """True if two vectors are of one optimum, or both are where the data tell nothing."""
-    return bool(np.max(np.abs(a - b)) < DISTINCT)
+    """True if two vectors are of one optimum; at the end of a range all x are one."""
+    shares = np.asarray(jax.nn.sigmoid(jnp.asarray([a, b])))
+    return bool(np.max(np.abs(shares[0] - shares[1])) < DISTINCT)
 
 
 def moved(search: Search, x: np.ndarray) -> np.ndarray:

@@ -24,7 +24,11 @@ def root(f: Callable[[Array], Array], low: Array, high: Array) -> Array:
     of which only the first derivatives, by whatever f knows, are kept: those of the implicit function
     theorem.
     """
-    found = lax.stop_gradient(_bracketed(f, lax.stop_gradient(low), lax.stop_gradient(high)))
+    pure, known = jax.closure_convert(
+        f, low
+    )  # what f knows is held fixed, or the search would be differentiated
+    held = [lax.stop_gradient(value) for value in known]
+    found = _bracketed(lambda x: pure(x, *held), lax.stop_gradient(low), lax.stop_gradient(high))
     value, slope = jax.jvp(f, (found,), (jnp.ones_like(found),))
     slope = lax.stop_gradient(slope)
     known = jnp.isfinite(value) & jnp.isfinite(slope) & (slope != 0.0)

@@ -51,6 +51,15 @@ def test_columns_by_another_name():
     assert data.columns["outer_radius"].name == "OD control"
 
 
+def test_columns_of_groups_wait_to_be_named():
+    text = "pressure_mmHg,outer_diameter_um_control,outer_diameter_um_hypoxic\n1,500,510\n2,510,512\n"
+    data = loads_data(text, "lpa.csv", {"outer_diameter_um_control": "outer_diameter_um"})
+    assert set(data.columns) == {"pressure", "outer_radius"}
+    assert data.ignored == (
+        "outer_diameter_um_hypoxic (to read it: --column 'outer_diameter_um_hypoxic=outer_diameter_um')",
+    )
+
+
 GOOD = "pressure_kPa,outer_radius_mm\n1,1.0\n2,1.1\n"
 
 
