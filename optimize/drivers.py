@@ -181,10 +181,14 @@ def levenberg_marquardt(
         found = np.nan_to_num(np.asarray(values(x)), nan=LARGEST_RESIDUAL)
         return np.clip(found, -LARGEST_RESIDUAL, LARGEST_RESIDUAL)
 
+    def finite_slopes(x: np.ndarray) -> np.ndarray:
+        found = np.nan_to_num(np.asarray(slopes(x)), nan=0.0, posinf=0.0, neginf=0.0)
+        return np.clip(found, -(LARGEST_RESIDUAL**2), LARGEST_RESIDUAL**2)
+
     found = scipy.optimize.least_squares(
         finite,
         start,
-        jac=lambda x: np.nan_to_num(np.asarray(slopes(x)), nan=0.0, posinf=0.0, neginf=0.0),
+        jac=finite_slopes,
         method="lm",
         x_scale=1.0,
         ftol=1e-9,

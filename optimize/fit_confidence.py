@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 from scipy import stats
@@ -19,6 +20,8 @@ MOST_TRIALS = 12
 """least squares for one end of an interval"""
 LONGEST = 2.0
 """step of x along a profile where the quadratic one says nothing"""
+MOST_RIVALS = 3
+"""other optima whose profiles are followed, the lowest first"""
 FACTOR = 5.0
 """a positive number is identified if its interval's ends differ by less than this factor"""
 SHARE = 0.5
@@ -82,7 +85,8 @@ def confidence(search: Search, best: Best, patterns: list[int]) -> Confidence:
     spread = stats.t.ppf(0.5 + 0.5 * LEVEL, independent - x.size)
     covariance = _covariance(slopes, variance)
     rise = variance * spread**2
-    rivals = tuple(other for other, squares in best.others if squares <= best.squares + rise)
+    near = (other for other, squares in best.others if squares <= best.squares + rise)
+    rivals = tuple(itertools.islice(near, MOST_RIVALS))
     optima = [(x, covariance)]
     optima += [(other, _covariance(search.slopes(other, best.scatter), variance)) for other in rivals]
     intervals = tuple(_interval(search, best, number, optima, rise, spread) for number in range(x.size))
