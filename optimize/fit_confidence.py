@@ -74,7 +74,7 @@ class Better(Exception):
 
 def confidence(search: Search, best: Best, patterns: list[int]) -> Confidence:
     """Confidence about an optimum; raises `Better` if there is a lower one beside it."""
-    x = best.x
+    x = np.clip(best.x, -FARTHEST, FARTHEST)
     slopes = search.slopes(x, best.scatter)
     residuals = search.residuals(x, best.scatter)
     counted, independent = _independent(search, residuals, patterns)
@@ -86,7 +86,7 @@ def confidence(search: Search, best: Best, patterns: list[int]) -> Confidence:
     covariance = _covariance(slopes, variance)
     rise = variance * spread**2
     near = (other for other, squares in best.others if squares <= best.squares + rise)
-    rivals = tuple(itertools.islice(near, MOST_RIVALS))
+    rivals = tuple(np.clip(other, -FARTHEST, FARTHEST) for other in itertools.islice(near, MOST_RIVALS))
     optima = [(x, covariance)]
     optima += [(other, _covariance(search.slopes(other, best.scatter), variance)) for other in rivals]
     intervals = tuple(_interval(search, best, number, optima, rise, spread) for number in range(x.size))
@@ -115,9 +115,15 @@ def _independent(search: Search, residuals: np.ndarray, patterns: list[int]) -> 
     return counted, independent
 
 
+LEAST_KNOWN = 1e-14
+"""share of the information's largest eigenvalue that the least counts as: what is not told varies widely"""
+
+
 def _covariance(slopes: np.ndarray, variance: float) -> np.ndarray:
     """Of x, in the quadratic approximation."""
-    found: np.ndarray = variance * np.linalg.pinv(slopes.T @ slopes, rcond=1e-14, hermitian=True)
+    information, vectors = np.linalg.eigh(slopes.T @ slopes)
+    floor = max(LEAST_KNOWN * float(information[-1]), 1e-300)
+    found: np.ndarray = (vectors * (variance / np.maximum(information, floor))) @ vectors.T
     return found
 
 
@@ -167,8 +173,10 @@ def _end(
         beyond = abs(x[number] + sign * at) > FARTHEST and outside is None
         if beyond:
             at = max(FARTHEST - sign * x[number], 0.0)
-        start = near + (x[number] + sign * at - near[number]) * along
-        found, squares = search.minimise(np.clip(start, -2 * FARTHEST, 2 * FARTHEST), best.scatter, number)
+        plain = np.where(np.arange(x.size) == number, x[number] + sign * at, near)
+        starts = (plain, np.clip(near + (plain - near)[number] * along, -2 * FARTHEST, 2 * FARTHEST))
+        start = min(starts, key=lambda start: float(np.sum(search.residuals(start, best.scatter) ** 2)))
+        found, squares = search.minimise(start, best.scatter, number)
         if squares < best.squares - 0.1 * rise:
             raise Better(found)
         height = float(np.sqrt(max(squares - best.squares, 0.0) / rise))
@@ -185,6 +193,9 @@ def _end(
         else:
             share = (1.0 - inside[1]) / (outside[1] - inside[1])
             at = inside[0] + (outside[0] - inside[0]) * min(max(share, 0.1), 0.9)
+    else:
+        if outside is None:
+            return None
     return float(x[number] + sign * at)
 
 
