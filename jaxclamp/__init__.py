@@ -83,6 +83,8 @@ from jaxclamp.solve.linear_solvers import cores  # noqa: E402
 from jaxclamp.solve.loading import load_result  # noqa: E402
 from jaxclamp.solve.memory import require_memory_for  # noqa: E402
 from jaxclamp.solve.results import versions  # noqa: E402
+from jaxclamp.specimens.sheet import flat_piece  # noqa: E402
+from jaxclamp.specimens.tube import inflated_tube  # noqa: E402
 from jaxclamp.trust.estimates import Estimate, Neighbours, neighbours, with_errors  # noqa: E402
 
 __all__ = [
@@ -124,8 +126,10 @@ __all__ = [
     "deformation_gradient",
     "dump_scene",
     "evaluate",
+    "flat_piece",
     "gradients",
     "import_parts",
+    "inflated_tube",
     "intima_contact_area",
     "jaw_curvature",
     "jaw_half_width",

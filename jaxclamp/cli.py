@@ -1,4 +1,4 @@
-"""The command line: `jaxclamp show`, `run`, `optimise`, `compare`, `accuracy` and `presets`.
+"""The command line: `jaxclamp show`, `run`, `optimise`, `compare`, `fit`, `accuracy` and `presets`.
 
 Exit codes: 0 done; 2 the input is wrong; 3 no converged solution; 4 the machine refused; 130
 interrupted; 143 terminated. What went wrong is one sentence on standard error. Results go to standard output,
@@ -10,22 +10,20 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from jaxclamp.core.failures import Failure
 from jaxclamp.core.signals import INTERRUPTED, TERMINATED, Terminated, ending
 from jaxclamp.scenes.presets import KINDS, preset
 from jaxclamp.scenes.presets import presets as shipped
 from jaxclamp.show import console, folders
+from jaxclamp.show.refusals import refusal
+from jaxclamp.show.steps import import_files, load, solve, write
 
-if TYPE_CHECKING:
-    from jaxclamp.scenes.scene import Scene
-
-DONE, WRONG_INPUT, NOT_CONVERGED, MACHINE_REFUSED = 0, 2, 3, 4
+DONE, NOT_CONVERGED = 0, 3
 """exit codes; failures bring their own"""
 
 app = typer.Typer(
@@ -67,6 +65,7 @@ OutOption = Annotated[
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")
 ]
+FREE = "Fit this number, such as media.k1, and those named alike; default: every constant but bulk."
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 
 
@@ -88,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except Exception as error:
-        known = _refusal(error)
+        known = refusal(error)
         if known is None:
             raise
         return _fail(*known)
@@ -101,23 +100,6 @@ def _fail(sentence: str, code: int) -> int:
     if sentence:
         typer.echo(f"jaxclamp: {' '.join(sentence.split())}", err=True)
     return code
-
-
-def _refusal(error: Exception) -> tuple[str, int] | None:
-    """Sentence and exit code of an error that is not a mistake of this program."""
-    if isinstance(error, Failure):
-        return str(error), error.exit_code
-    if (usage := getattr(error, "format_message", None)) is not None:  # of the command itself
-        return usage(), WRONG_INPUT
-    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-        return (
-            "not enough memory: take a coarser mesh (--fidelity draft, or fewer mesh elements)",
-            MACHINE_REFUSED,
-        )
-    if isinstance(error, OSError):
-        where = f" {error.filename}" if error.filename else ""
-        return f"the machine refused{where}: {error.strerror or error}", MACHINE_REFUSED
-    return None
 
 
 # ---------------------------------------------------------------------------------- commands
@@ -154,8 +136,8 @@ def show(
     from jaxclamp.core.surroundings import use_cpu
 
     use_cpu()
-    _import(parts)
-    loaded = _load(scene, fidelity, overrides, quiet)
+    import_files(parts)
+    loaded = load(scene, fidelity, overrides, quiet)
     from jaxclamp.show.description import describe
 
     described = describe(loaded)
@@ -177,8 +159,8 @@ def run(
     quiet: QuietOption = False,
 ) -> int:
     """Clamp an artery: stress-free, load-free, physiological, clamped to the stop."""
-    _import(parts)
-    loaded = _load(scene, fidelity, overrides, quiet)
+    import_files(parts)
+    loaded = load(scene, fidelity, overrides, quiet)
     folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-result")
     if folder is not None:
         folders.check_results(folder, scene)
@@ -186,8 +168,8 @@ def run(
 
     unlikely = notes(loaded)
     _tell(unlikely, quiet)
-    result, failure = _solve(loaded, quiet)
-    files = _write(result, folder, quiet) if result is not None and folder is not None else []
+    result, failure = solve(loaded, quiet)
+    files = write(result, folder, quiet) if result is not None and folder is not None else []
     if result is not None and as_json:
         typer.echo(console.as_json(result.to_dict()))
     elif result is not None and not quiet:
@@ -218,7 +200,7 @@ def optimise(
     from optimize.report import warning, write_found
     from optimize.study_file import load_study
 
-    _import(parts)
+    import_files(parts)
     asked = load_study(study)
     folder = out or Path(f"{Path(study).stem}-study")
     folders.check(folder)
@@ -266,7 +248,7 @@ def compare(
     from optimize.comparison import compare as compare_clamps
     from optimize.comparison_report import require_ours, write_comparison
 
-    _import(parts)
+    import_files(parts)
     asked = asked_clamps(scene, clamps, overrides or (), fidelity or "standard")
     rank_by, measure = ranking(rank, tuple(layer.name for layer in asked[0].scene.artery.layers))
     folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-compared")
@@ -287,6 +269,60 @@ def compare(
 
 
 @app.command()
+def fit(
+    data: Annotated[list[str], typer.Argument(metavar="DATA.csv…", help="Test data, units in the headers.")],
+    scene: Annotated[str, typer.Option("--scene", metavar="SCENE", help="What is fitted, and its start.")],
+    free: Annotated[list[str] | None, typer.Option("--free", metavar="PATH", help=FREE)] = None,
+    fixed: Annotated[
+        list[str] | None, typer.Option("--fix", metavar="PATH", help="Leave this number; repeatable.")
+    ] = None,
+    ties: Annotated[
+        list[str] | None,
+        typer.Option("--tie", metavar="TIE", help="Such as 'adventitia.c = media.c / 10'; repeatable."),
+    ] = None,
+    columns: Annotated[
+        list[str] | None,
+        typer.Option("--column", metavar="HEADER=NAME", help="Read a column by this name; repeatable."),
+    ] = None,
+    given: Annotated[
+        str, typer.Option("--given", metavar="radius|pressure", help="Compare a tube at this.")
+    ] = "radius",
+    starts: Annotated[int, typer.Option("--starts", metavar="N", help="From how many starts.")] = 20,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of random starts.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="./SCENE-fit"),
+    ] = None,
+    overrides: SetOption = None,
+    parts: ImportOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Find the constants of a wall from test data, with their confidence."""
+    from optimize.fit import Asked, fit_files
+    from optimize.fit_report import lines, require_ours, write_fit
+
+    import_files(parts)
+    loaded = load(scene, None, overrides, quiet)
+    folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-fit")
+    if folder is not None:
+        folders.check(folder)
+        require_ours(folder)
+    asked = Asked(free or (), fixed or (), ties or (), columns or (), given, starts, seed)
+    with console.progress(quiet) as progress:
+        tell = progress if callable(progress) else None
+        found = fit_files(data, loaded, asked, tell)
+        files = [] if folder is None else write_fit(found, folder, tell)
+    if as_json:
+        typer.echo(console.as_json(found.to_dict()))
+    elif not quiet:
+        typer.echo("\n".join([found.scene.title, *lines(found), "", *(f"  open {path}" for path in files)]))
+    for warning in found.warnings:
+        typer.echo(f"jaxclamp: warning: {warning}", err=True)
+    return DONE if found.follows else NOT_CONVERGED
+
+
+@app.command()
 def accuracy(
     scene: SceneArgument,
     out: Annotated[
@@ -300,8 +336,8 @@ def accuracy(
     quiet: QuietOption = False,
 ) -> int:
     """What accuracy costs: error against time and memory over mesh, element, penalties and solver."""
-    _import(parts)
-    loaded = _load(scene, fidelity, overrides, quiet)
+    import_files(parts)
+    loaded = load(scene, fidelity, overrides, quiet)
     folder = out or Path(f"{Path(scene).stem}-accuracy")
     folders.check(folder)
     from jaxclamp.show.price_report import lines, write_prices
@@ -335,58 +371,6 @@ def presets(
         typer.echo(f"{each.kind:<{max(map(len, KINDS))}}  {each.name:<{width}}  {each.title}")
 
 
-# ---------------------------------------------------------------------------------- steps of run
-
-
-def _import(files: list[str] | None) -> None:
-    """Run a user's files of parts; what they print is no result."""
-    from jaxclamp.observe.parts import import_parts
-
-    with redirect_stdout(sys.stderr):
-        for file in files or ():
-            import_parts(file)
-
-
 def _tell(notes: list[str], quiet: bool) -> None:
     for note in () if quiet else notes:
         typer.echo(f"note: {note}", err=True)
-
-
-def _load(scene: str, fidelity: str | None, overrides: list[str] | None, quiet: bool) -> Scene:
-    from jaxclamp.scenes.fidelity import ERRORS_ON_HUMAN_LAD
-    from jaxclamp.scenes.files import load_scene, own_mesh_keys
-
-    loaded = load_scene(scene, overrides or (), fidelity or "standard")
-    if fidelity is None or quiet:
-        return loaded
-    if own := own_mesh_keys(scene):
-        keys = ", ".join(f"mesh.{key}" for key in own)
-        typer.echo(f"note: {scene} sets {keys} itself; --fidelity {fidelity} leaves that as it is", err=True)
-    else:
-        errors = ", ".join(
-            f"{error:.1%} in the {name}" for name, error in ERRORS_ON_HUMAN_LAD[fidelity].items()
-        )
-        said = f"on human-lad, errors of {errors}; those of this scene are estimated at the end"
-        typer.echo(f"note: --fidelity {fidelity}: {said}", err=True)
-    return loaded
-
-
-def _solve(scene: Scene, quiet: bool) -> tuple[Any, Failure | None]:
-    """The result (None if there is nothing to keep), and why it does not reach the stop."""
-    from jaxclamp.core.failures import EquilibriumError
-    from jaxclamp.solve.clamping import clamp
-    from jaxclamp.trust.estimates import with_errors
-
-    try:
-        with console.progress(quiet) as progress:
-            result = with_errors(clamp(scene, progress=progress))
-    except EquilibriumError as error:
-        return error.result, error
-    return result, None if result.converged else result.failure
-
-
-def _write(result: Any, folder: Path, quiet: bool) -> list[Path]:
-    from jaxclamp.show.export import write_outputs
-
-    with console.progress(quiet) as progress:
-        return list(write_outputs(result, folder, progress if callable(progress) else None))

@@ -16,6 +16,7 @@ ROOMS = (
     "core",
     "physics",
     "scenes",
+    "specimens",
     "fem",
     "potential",
     "observe",

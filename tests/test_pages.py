@@ -70,6 +70,8 @@ def test_commands_are_commands(line, tmp_path, monkeypatch):
     if command == "optimise":
         preset(rest[0])
         return
+    if command == "fit":  # its files are the reader's own
+        rest = rest[rest.index("--scene") + 1 :]
     if command != "presets":
         settings = [word for before, word in itertools.pairwise(rest) if before == "--set"]
         rest = [rest[0], *(part for setting in settings for part in ("--set", setting))]

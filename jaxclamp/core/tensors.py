@@ -127,13 +127,17 @@ def half_square(u: Array, width: Array | float) -> Array:
 
 
 def exponential_stiffening(k2: Array, E: Array) -> Array:
-    """(exp(k2 E**2) - 1) / (2 k2), for k2 >= 0; its limit E**2 / 2 at k2 = 0.
+    """(exp(k2 E**2) - 1) / (2 k2), for k2 >= 0; its limit E**2 / 2 at k2 = 0. See `exponential_growth`."""
+    return exponential_growth(k2, E * E, k2 * E * E)
+
+
+def exponential_growth(k2: Array, S: Array, q: Array) -> Array:
+    """(exp(q) - 1) / (2 k2) with q = k2 S, for k2 >= 0 and S >= 0; its limit S / 2 at k2 = 0.
 
     Where the exponential leaves the range of float64 the value is +inf. Derivatives are exact for
     exponents up to `LARGEST_EXPONENT`; beyond, they are those of the straight continuation, so
     they stay finite and keep their sign: a trial state may be absurd, but never NaN.
     """
-    q = k2 * E * E
     small = q < 1e-2
     q_inside = jnp.where(small | (q > LARGEST_EXPONENT), 1.0, q)
     q_small = jnp.where(small, q, 0.0)
@@ -141,7 +145,7 @@ def exponential_stiffening(k2: Array, E: Array) -> Array:
     series = 1.0 + q_small / 2 * (
         1.0 + q_small / 3 * (1.0 + q_small / 4 * (1.0 + q_small / 5 * (1.0 + q_small / 6)))
     )
-    inside = 0.5 * E * E * jnp.where(small, series, jnp.expm1(q_inside) / q_inside)
+    inside = 0.5 * S * jnp.where(small, series, jnp.expm1(q_inside) / q_inside)
     k2_safe = jnp.where(small, 1.0, lax.stop_gradient(k2))
     slope = jnp.exp(LARGEST_EXPONENT) / (2.0 * k2_safe)
     beyond = lax.stop_gradient(jnp.expm1(q) / (2.0 * k2_safe)) + (q - lax.stop_gradient(q)) * slope

@@ -17,7 +17,17 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxclamp.core.records import quantity, record, static
-from jaxclamp.core.tensors import Tensor, Vector, det, exponential_stiffening, squared, squared_norm, total
+from jaxclamp.core.tensors import (
+    Tensor,
+    Vector,
+    det,
+    exponential_growth,
+    exponential_stiffening,
+    safe_sqrt,
+    squared,
+    squared_norm,
+    total,
+)
 
 
 class Material(abc.ABC):
@@ -201,3 +211,85 @@ class GOH(FibreLaw):
             E = I1_part + (1.0 - 3.0 * self.dispersion) * (scale * stretch_squared - 1.0)
             parts.append(self.k1 * exponential_stiffening(self.k2, jnp.maximum(E, 0.0)))
         return parts
+
+
+@record
+class HSGR(FibreLaw):
+    """Fibres that the ground's strain recruits, too: S = (1 - rho) (I1_bar - 3)**2 + rho <I4_bar - 1>**2.
+
+    k1/(2 k2) (exp(k2 S) - 1) per family: Holzapfel, Sommer, Gasser & Regitnig, Am J Physiol 289 (2005)
+    H2048. They write mu (I1 - 3) for c/2 (I1 - 3), so c = 2 mu, and let a family whose I4 <= 1 carry nothing:
+    its energy then jumps there, by its share of I1. Here only the part of I4 ends (<x> is max(x, 0)), which
+    is the same while fibres are stretched and continuous where they slacken. rho 1 gives the HGO law of Eq.
+    (4), rho 0 an isotropic one.
+    """
+
+    law: str = static("hsgr2005")
+    c: Array = quantity("kPa", 1e-6, 1e9)
+    """shear modulus of the ground substance"""
+    k1: Array = quantity("kPa", 0.0, 1e9)
+    """fibre stiffness"""
+    k2: Array = quantity("", 0.0, 1e4)
+    """fibre stiffening, no unit"""
+    rho: Array = quantity("", 0.0, 1.0)
+    """0: isotropic; 1: fibres answer to their own stretch alone"""
+    fibre_angle: Array = quantity("deg", 0.0, 90.0)
+    """angle of both families from the circumferential direction"""
+    bulk: Array = quantity("kPa", 1e-3, 1e12)
+    """bulk modulus, the penalty on the change of volume"""
+
+    def directions(self) -> tuple[Vector, ...]:
+        return _two_families(self.fibre_angle)
+
+    def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        return total(self.parts_of(I1, J, I4))
+
+    def parts_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> list[Array]:
+        scale = J ** (-2.0 / 3.0)
+        parts = [_matrix(self.c, scale * I1)]
+        ground = (1.0 - self.rho) * (scale * I1 - 3.0) ** 2
+        for stretch_squared in I4:
+            S = ground + self.rho * jnp.maximum(scale * stretch_squared - 1.0, 0.0) ** 2
+            parts.append(self.k1 * exponential_growth(self.k2, S, self.k2 * S))
+        return parts
+
+
+@record
+class Fung(FibreLaw):
+    """An orthotropic exponential of the strains in the layer's surface, in a neo-Hookean matrix.
+
+    c/2 (I1_bar - 3) + k1/2 (exp(Q) - 1), Q = b_t E_t**2 + b_z E_z**2 + 2 a sqrt(b_t b_z) E_t E_z with the
+    Green strains E = (C_bar - 1)/2 around and along the artery: the form of Fung, Fronek & Patitucci, Am J
+    Physiol 237 (1979) H620, their a_1, a_2, a_4 and c being b_t, b_z, a sqrt(b_t b_z) and k1. Written so, Q
+    is never negative for couplings a from 0 to 1, which a free coefficient a_4 does not ensure (Holzapfel,
+    Gasser & Ogden, J Elasticity 61 (2000) 1, sec. 3.2). The matrix is what a law of membrane strains lacks:
+    it carries shear and what is radial.
+    """
+
+    law: str = static("fung")
+    c: Array = quantity("kPa", 1e-6, 1e9)
+    """shear modulus of the ground substance"""
+    k1: Array = quantity("kPa", 0.0, 1e9)
+    """stiffness of the exponential part"""
+    b_circumferential: Array = quantity("", 0.0, 1e4)
+    """stiffening around the artery, no unit"""
+    b_axial: Array = quantity("", 0.0, 1e4)
+    """stiffening along the artery, no unit"""
+    coupling: Array = quantity("", 0.0, 1.0)
+    """of both: the mixed coefficient over its largest possible, sqrt(b_t b_z)"""
+    bulk: Array = quantity("kPa", 1e-3, 1e12)
+    """bulk modulus, the penalty on the change of volume"""
+
+    def directions(self) -> tuple[Vector, ...]:
+        nothing, one = jnp.zeros_like(self.c), jnp.ones_like(self.c)
+        return (nothing, one, nothing), (nothing, nothing, one)
+
+    def psi_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> Array:
+        return total(self.parts_of(I1, J, I4))
+
+    def parts_of(self, I1: Array, J: Array, I4: Sequence[Array]) -> list[Array]:
+        scale = J ** (-2.0 / 3.0)
+        E_t, E_z = (0.5 * (scale * stretch_squared - 1.0) for stretch_squared in I4)
+        t, z = safe_sqrt(self.b_circumferential) * E_t, safe_sqrt(self.b_axial) * E_z
+        Q = t * t + z * z + 2.0 * self.coupling * t * z
+        return [_matrix(self.c, scale * I1), self.k1 * exponential_growth(jnp.ones_like(Q), Q, Q)]

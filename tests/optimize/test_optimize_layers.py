@@ -38,6 +38,14 @@ LEVEL = {
     "report": 8,
     "comparison": 2,
     "comparison_report": 7,
+    "fit_header": 0,
+    "fit_parameters": 0,
+    "fit_data": 1,
+    "fit_model": 2,
+    "fit_search": 3,
+    "fit_confidence": 4,
+    "fit": 5,
+    "fit_report": 7,
     "__init__": 9,
 }
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from jaxclamp.core.tensors import LARGEST_EXPONENT, det, pointwise_derivatives, total
-from jaxclamp.physics.materials import GOH, HGO, FibreLaw, Material, NeoHookean
+from jaxclamp.physics.materials import GOH, HGO, HSGR, FibreLaw, Fung, Material, NeoHookean
 from laws import every_law, example
 
 
@@ -77,6 +77,7 @@ def basis(i: int, j: int) -> jax.Array:
 def test_constituents_add_up(law):
     parts = law.constituents(moderate)
     families = len(law.directions()) if isinstance(law, FibreLaw) else 0
+    families = 1 if isinstance(law, Fung) else families  # one exponential of both strains
     assert len(parts) == 1 + families
     np.testing.assert_allclose(sum(parts), law.psi_bar(moderate), rtol=1e-14)
     assert all(np.min(part) >= 0.0 for part in parts)
@@ -245,8 +246,12 @@ def test_fibres_carry_no_compression(law):
     F = np.zeros((3, 3, 40))
     F[1, 1], F[2, 2] = stretch
     F[0, 0] = 1.0 / (stretch[0] * stretch[1])
+    if isinstance(law, Fung):
+        pytest.skip("an exponential of strains, not of fibres")
     if isinstance(law, GOH):
         law = dataclasses.replace(law, dispersion=jnp.asarray(0.0))
+    if isinstance(law, HSGR):
+        law = dataclasses.replace(law, rho=jnp.asarray(1.0))
     matrix = NeoHookean(c=law.c, bulk=law.bulk)
     np.testing.assert_allclose(psi(law, jnp.asarray(F)), psi(matrix, jnp.asarray(F)), rtol=1e-12)
 
@@ -275,6 +280,42 @@ def test_dispersion_between_depends_on_the_angle():
     assert np.max(np.abs(np.asarray(psi(laws[0], moderate) - psi(laws[1], moderate)))) > 1e-3
 
 
+def test_rho_one_is_hgo():
+    hsgr = example(HSGR, rho=jnp.asarray(1.0))
+    hgo = HGO(c=hsgr.c, k1=hsgr.k1, k2=hsgr.k2, fibre_angle=hsgr.fibre_angle, bulk=hsgr.bulk)
+    np.testing.assert_allclose(psi(hsgr, moderate), psi(hgo, moderate), rtol=1e-12)
+    np.testing.assert_allclose(stress(hsgr, moderate), stress(hgo, moderate), rtol=1e-10, atol=1e-10)
+
+
+def test_rho_zero_forgets_the_angle():
+    laws = [example(HSGR, rho=jnp.asarray(0.0), fibre_angle=jnp.asarray(b)) for b in (0.0, 0.4, 1.5)]
+    for law in laws[1:]:
+        np.testing.assert_allclose(psi(law, moderate), psi(laws[0], moderate), rtol=1e-12)
+
+
+def test_stress_is_continuous_where_fibres_of_hsgr_slacken():
+    """At I4 = 1 the ground has a strain of its own, which the printed switch would drop at once."""
+    law = example(HSGR, fibre_angle=jnp.asarray(0.0), rho=jnp.asarray(0.5), c=jnp.asarray(1.0))
+    F = lambda hoop: (hoop * basis(1, 1) + 1.4 * basis(0, 0) + basis(2, 2) / (1.4 * hoop)).astype(float)
+    below, above = stress(law, F(1.0 - 1e-9)), stress(law, F(1.0 + 1e-9))
+    np.testing.assert_allclose(below, above, atol=1e-6 * float(jnp.max(jnp.abs(above))))
+
+
+def test_fung_is_as_stiff_around_and_along_as_its_coefficients_say():
+    """In plane strain, F = diag(1/l, l, 1): E_t = l - 1 + ..., so psi'' = 4 c + k1 b_t at l = 1."""
+    law = example(Fung)
+    zero, one = jnp.asarray(0.0), jnp.asarray(1.0)
+    for axis, b in ((1, law.b_circumferential), (2, law.b_axial)):
+
+        def energy(stretch, axis=axis):
+            diagonal = [1.0 / stretch, one, one]
+            diagonal[axis] = stretch
+            return law.psi({(i, j): diagonal[i] if i == j else zero for i in range(3) for j in range(3)})
+
+        curvature = float(jax.jit(jax.grad(jax.grad(energy)))(one))
+        assert curvature == pytest.approx(4.0 * float(law.c) + float(law.k1 * b), rel=1e-12)
+
+
 # ------------------------------------------------------------------------------------ extremes
 
 
@@ -289,6 +330,11 @@ def exact_psi(law: Material, F: np.ndarray) -> mpmath.mpf:
         energy = number("bulk") / 2 * (J - 1) ** 2 + number("c") / 2 * (I1 - 3)
         if isinstance(law, NeoHookean):
             return energy
+        if isinstance(law, Fung):
+            E_t, E_z = (shrink * C[1, 1] - 1) / 2, (shrink * C[2, 2] - 1) / 2
+            b_t, b_z = number("b_circumferential"), number("b_axial")
+            Q = b_t * E_t**2 + b_z * E_z**2 + 2 * number("coupling") * mpmath.sqrt(b_t * b_z) * E_t * E_z
+            return energy + number("k1") / 2 * mpmath.expm1(Q)
         for sign in (1, -1):
             a = mpmath.matrix(
                 [0, mpmath.cos(number("fibre_angle")), sign * mpmath.sin(number("fibre_angle"))]
@@ -296,11 +342,16 @@ def exact_psi(law: Material, F: np.ndarray) -> mpmath.mpf:
             I4 = (a.T * C * a)[0]
             if getattr(law, "fibre_invariant", "isochoric") == "isochoric":
                 I4 = I4 * shrink
+            k1, k2 = number("k1"), number("k2")
+            if isinstance(law, HSGR):
+                rho = number("rho")
+                S = (1 - rho) * (I1 - 3) ** 2 + rho * max(I4 - 1, 0) ** 2
+                energy += k1 * (mpmath.expm1(k2 * S) / (2 * k2) if k2 else S / 2)
+                continue
             d = number("dispersion") if isinstance(law, GOH) else mpmath.mpf(0)
             E = d * (I1 - 3) + (1 - 3 * d) * (I4 - 1)
             if E <= 0:
                 continue
-            k1, k2 = number("k1"), number("k2")
             fibre = mpmath.expm1(k2 * E**2) / (2 * k2) if k2 else E**2 / 2
             if getattr(law, "fibre_energy", "eq4") == "eq10":
                 fibre -= E**2 / 2
