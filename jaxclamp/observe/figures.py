@@ -29,9 +29,10 @@ from jaxclamp.observe.measures import (
     rigid_coordinate,
     smooth_peak,
     stress_at_P,
+    sunk,
     travel_of_a_jaw,
 )
-from jaxclamp.observe.stresses import gaps, node_gaps, noise
+from jaxclamp.observe.stresses import gaps, noise
 from jaxclamp.potential.energy import gather
 from jaxclamp.potential.terms import JAWS
 
@@ -119,11 +120,6 @@ def _penetration(e: Equilibria) -> Array:
     return jnp.maximum(jnp.max(jnp.stack(deepest)), 0.0)
 
 
-def _penetration_of_nodes(e: Equilibria) -> Array:
-    deepest = [jnp.max(-node_gaps(group, e.last)) for group in e.potential.of(JAWS)]
-    return jnp.maximum(jnp.max(jnp.stack(deepest)), 0.0)
-
-
 # --- stress -----------------------------------------------------------------------------------------
 
 
@@ -178,7 +174,7 @@ FIGURES = (
         lambda e: 1e-3 * force_aside(e),
         contract=False,
     ),
-    Figure(NODES_SUNK, "deepest node of the wall inside a jaw", _penetration_of_nodes, contract=False),
+    Figure(NODES_SUNK, "how far the wall's middle node is above the jaw's face", sunk, contract=False),
     Figure("lumen_height_mm", "lumen height", _height, order=WHOLE, shown=("summary", "numbers")),
     Figure(
         "lumen_width_mm",

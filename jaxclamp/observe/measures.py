@@ -19,7 +19,7 @@ from jaxclamp.core.tensors import smooth_maximum, total
 from jaxclamp.fem import landmarks
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.measure import Measure
-from jaxclamp.observe.stresses import facet_contact, touching
+from jaxclamp.observe.stresses import facet_contact, node_gaps, touching
 from jaxclamp.potential.energy import group_energy
 from jaxclamp.potential.energy import stored_energy as _stored_energy
 from jaxclamp.potential.terms import JAWS, Potential
@@ -188,6 +188,21 @@ def rigid_coordinate(e: Equilibria, name: str) -> Array:
 def force_aside(e: Equilibria) -> Array:
     """Force that holds the whole artery sideways, mN."""
     return e.marks.symmetry.parts * jnp.abs(rigid_coordinate(e, "side_force"))
+
+
+def sunk(e: Equilibria) -> Array:
+    """How far the outer wall's node in the middle is above the jaw's face there, mm.
+
+    A bar thinner than the facets are long passes between contact points. Of jaws that may end before the
+    middle: how deep any node is inside one.
+    """
+    here = e.potential.of(JAWS)[0].here(JAWS)
+    if here.placement.tip is not None:
+        deepest = [jnp.max(-node_gaps(group, e.last)) for group in e.potential.of(JAWS)]
+        return jnp.max(jnp.stack(deepest))
+    back = sum(part.height(0.0, 0.0) for part in getattr(here.jaw, "relief", []))
+    middle = rigid_coordinate(e, "clamp_height")
+    return e.last.x[e.marks.outer_top, 1] - middle - e.last.jaw_height - back
 
 
 def travel_of_a_jaw(e: Equilibria) -> Array:

@@ -87,7 +87,7 @@ def get(scene: Any, address: str) -> Any:
     Raises BadAddress, a SceneError and a KeyError, if there is no such place.
     """
     found = _find(scene, address)
-    if found.factor == 1.0:
+    if found.factor == 1.0 or found.value is None:
         return found.value
     if isinstance(found.value, int | float):
         return in_file_unit(found.value, found.factor)

@@ -188,6 +188,8 @@ def _put_in(owner: dict[str, Any], key: str, kind: str, where: str, source: str)
 
 def _scene(table: dict[str, Any], fidelity: str) -> Scene:
     table = dict(table)
+    if "artery" in table and "clamp" not in table:  # every key of it may be left out, not all of them
+        raise BadKey("clamp is missing: expected a table with jaw, or with upper and lower")
     if isinstance(table.get("clamp"), dict):
         table["clamp"] = _one_jaw(table["clamp"])
     mesh, contact = table.get("mesh", {}), table.get("contact", {})

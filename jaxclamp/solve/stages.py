@@ -17,6 +17,7 @@ from jaxclamp.core.progress import Progress, Tell
 from jaxclamp.fem.landmarks import half_height
 from jaxclamp.observe.equilibria import Equilibria
 from jaxclamp.observe.figures import Record, read_figures
+from jaxclamp.observe.measures import sunk
 from jaxclamp.observe.stops import OcclusionStop
 from jaxclamp.observe.stresses import Stresses, stresses
 from jaxclamp.potential.densities import rigid
@@ -47,6 +48,7 @@ AT_THE_STOP = 1e-8
 RESCUE_MOVE = 0.02
 """jaw move of a descent, as part of the outer radius"""
 MAX_RESCUES = 60
+TOO_MANY_RESCUES = f"{MAX_RESCUES} descents did not lead to the stop"
 LOAD_STEP = 0.3
 """first step of pressure and stretch, as part of the whole"""
 
@@ -69,8 +71,7 @@ class Clamping:
         before: Clamping | None = None,
     ) -> None:
         """solver: to factor with; every_term: leave nothing out because the stop seems not to need it;
-        before: an attempt at the same that came to nothing, whose work counts
-        """
+        before: an attempt at the same that came to nothing, whose work counts"""
         self.model, self.tell, self.every_term = model, tell, every_term
         self.states: list[Kept] = []
         settings = model.scene.solver
@@ -145,8 +146,7 @@ class Clamping:
     def load_free(self, guess: State | None = None) -> Equilibrium:
         """Close the open sectors: no pressure, no stretch, the jaw far away.
 
-        The round tube counts even if it is not stable: unloaded, a wall may wrinkle that is smooth in the
-        body.
+        The round tube counts even if it is not stable: a wall may wrinkle unloaded, and be smooth in use.
         """
         self.tell(Progress("load-free", 0.0, "closing the open sectors"))
         scene, model = self.model.scene, self.model
@@ -203,8 +203,7 @@ class Clamping:
             if path is None:
                 return equilibrium
             equilibrium = self.walk("clamping", equilibrium, path, self.tell_closing, reached)
-        failed = NotConverged(f"{MAX_RESCUES} descents did not lead to the stop")
-        raise self.error("clamping", equilibrium, failed)
+        raise self.error("clamping", equilibrium, NotConverged(TOO_MANY_RESCUES))
 
     def first_contact(self, in_body: Equilibrium) -> Equilibrium:
         """The jaw just on the artery, not beyond the stop."""
@@ -215,7 +214,8 @@ class Clamping:
             load = f"first contact, jaw height {touch:.3f} mm"
             equilibrium = self.solve_or_descend("clamping", start, self.step(Held(touch)), load)
             beyond = self.distance(equilibrium) if self.share(equilibrium.state) > 1.0 else 0.0
-            if beyond == 0.0 and stride and not np.any(equilibrium.lin.coupling[:, 0]):
+            late = stride and not beyond and not np.any(equilibrium.lin.coupling[:, 0])
+            if late and sunk(self.known(self.body, equilibrium.state)) <= 0.0:
                 move, stride = move + stride, stride if move < self.outer_radius else 0.0
                 continue
             if beyond == 0.0 or move == 0.0:
@@ -282,8 +282,8 @@ class Clamping:
 
     def at_stop(self, near: State) -> Step:
         """What the stop asks of the final state."""
-        stop = self.model.scene.stop
-        return self.step(Until(stop, float(stop.target()), self.known(self.body, near)))
+        stop, known = self.model.scene.stop, self.known(self.body, near)
+        return self.step(Until(stop, float(stop.target()), known))
 
     # --- pieces ---------------------------------------------------------------------------------------
 
@@ -374,7 +374,7 @@ class Clamping:
             raise EquilibriumError(stage, f"at {load}", error, ADVICE[stage]) from error
 
     def settle(self, start: State, step: Step, before: Equilibrium | None = None) -> Equilibrium:
-        """A stable equilibrium at a held jaw: by Newton's method, or else downhill. Raises NotConverged.
+        """A stable equilibrium at a held jaw, by Newton's method or downhill. Raises NotConverged.
 
         before: the equilibrium that Newton's method is to stay on the path of
         """

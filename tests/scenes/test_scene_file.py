@@ -450,13 +450,13 @@ def test_a_quantity_has_a_unit_that_is_known():
         quantity("furlong", 0.0, 1.0)
 
 
-def test_equal_jaws_are_one_and_different_ones_are_refused():
+def test_equal_jaws_are_one_and_different_ones_are_two():
     table = scene_table(FLAT, {"occlusion": 0.9})
     alike = {**table, "clamp": {"upper": FLAT, "lower": dict(reversed(FLAT.items()))}}
     assert same(loads(alike), loads(table))
-    assert "two different jaws are not available yet" in refusal(
-        {**table, "clamp": {"upper": FLAT, "lower": CYLINDER}}
-    )
+    unlike = loads({**table, "clamp": {"upper": FLAT, "lower": CYLINDER}})
+    assert [jaw.shape for jaw in unlike.clamp.jaws] == ["flat", "cylinder"]
+    assert unlike.clamp.jaw is None
     for clamp in ({"upper": FLAT}, {"upper": FLAT, "lower": FLAT, "jaw": FLAT}):
         assert "expected either jaw, or both upper and lower" in refusal({**table, "clamp": clamp})
     assert "clamp.lower.half_width_mm" in refusal(

@@ -473,7 +473,7 @@ def test_presets_are_listed_by_kind_name_and_title(capsys):
     listed = [line.split(maxsplit=2) for line in out.splitlines()]
     assert listed == [[p.kind, p.name, p.title] for p in presets()]
     assert [kind for kind, *_ in listed] == sorted(
-        (kind for kind, *_ in listed), key=["scene", "artery", "jaw", "study"].index
+        (kind for kind, *_ in listed), key=["scene", "artery", "jaw", "clamp", "study"].index
     )
     assert json.loads(call(capsys, "presets", "--json")[1])[0]["name"] == "human-lad"
 
