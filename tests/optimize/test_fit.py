@@ -138,6 +138,7 @@ def test_patterns_and_scatter():
 # ------------------------------------------------------------------------------------------- fits
 
 
+@pytest.mark.slow
 def test_constants_are_found_again():
     """Without noise, from far off, to 1e-4; a scene that a file can hold comes out."""
     found = fit([loads_data(inflation(ring()))], lad(*START), Asked(starts=3))

@@ -76,7 +76,12 @@ FACES = {
 }
 
 
-@pytest.mark.parametrize("name", FACES)
+QUICK = ("flat, sine along", "flat, wedge both", "bar, sine", "grooved, toothed")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in FACES]
+)
 def test_a_gap_with_relief_is_the_distance_from_its_face(name):
     """Zero where the smooth face is displaced by the height; gradient of length 1 there; second derivatives
     that agree with differences of the first across the face."""

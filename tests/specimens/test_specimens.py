@@ -84,7 +84,12 @@ def test_an_outer_radius_without_room_for_the_wall_is_no_nan():
 
 @pytest.mark.parametrize(
     "address",
-    ["material.c", "material.k1", "material.k2", "material.fibre_angle", "opening_angle", "thickness"],
+    [
+        "material.k2",
+        "opening_angle",
+        *(pytest.param(f"material.{name}", marks=pytest.mark.slow) for name in ("c", "k1", "fibre_angle")),
+        pytest.param("thickness", marks=pytest.mark.slow),
+    ],
 )
 def test_slopes_of_radius_and_force(address):
     """The root's derivatives against central differences."""
