@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
+import jaxclamp as jc
 from jaxclamp import Jaw, Measure, Result
 from jaxclamp.pictures.fields import LayerFields, contact_along, layer_fields
 from jaxclamp.pictures.plots import Plate
@@ -39,6 +40,7 @@ from jaxclamp.pictures.plots.style import (
     stress_colours,
 )
 from optimize.named_measures import in_words
+from optimize.problem import Constraint
 from optimize.record import FEASIBLE
 from optimize.study import Study
 
@@ -218,6 +220,49 @@ def plot_convergence(study: Study) -> Picture:
     return figure
 
 
+MOST_LIMITS = 3
+"""constraints that are drawn"""
+
+
+def limits(study: Study) -> list[tuple[int, Constraint]]:
+    """The constraints that are of the artery, not of the jaw's shape alone, with their places."""
+    shape = jc.jaw_curvature().name, jc.jaw_half_width().name
+    every = [(i, c) for i, c in enumerate(study.problem.constraints) if c.measure.name not in shape]
+    return every[:MOST_LIMITS]
+
+
+def plot_limits(study: Study) -> Picture:
+    """The objective of every design over what is constrained, the bounds as lines."""
+    drawn = limits(study)
+    figure = Picture(3.4 * max(len(drawn), 1) + 1.0, 3.5)
+    grid = figure.subplots(1, max(len(drawn), 1), squeeze=False, sharey=True)
+    solved = [e for e in study.evaluations if e.failure is None]
+    for column, (place, c) in enumerate(drawn):
+        axes: Axes = grid[0, column]
+        for good, fill, label in ((True, "full", "feasible"), (False, "none", "violates a constraint")):
+            points = [
+                e.values[[1 + place, 0]] for e in solved if good is (e.violation(study.problem) <= FEASIBLE)
+            ]
+            if points:
+                axes.plot(
+                    *np.transpose(points),
+                    "o",
+                    color=CIRCUMFERENTIAL,
+                    fillstyle=fill,
+                    markersize=4,
+                    label=label,
+                )
+        for bound, _ in c.sides:
+            axes.axvline(bound, color=THIRD, linewidth=1.2, label="bound")
+        for name, result in shown(study).items():
+            pair = result.measure(c.measure), result.measure(study.problem.objective)
+            axes.plot(*pair, "D", color=COLOURS[name], markersize=7, label=name)
+        dress(axes, labelled(c.measure), "" if column else labelled(study.problem.objective))
+    if drawn:
+        legend(grid[0, 0])
+    return figure
+
+
 def plot_force_travel(study: Study) -> Picture:
     """Force on one jaw against its travel."""
     figure = Picture(5.6, 3.5)
@@ -281,6 +326,12 @@ PLATES = (
         plot_convergence,
     ),
     (
+        "limits",
+        "Objective against what is constrained",
+        "Every design that was solved: what was minimised over what has a bound, which is the line.",
+        plot_limits,
+    ),
+    (
         "force_travel",
         "Force",
         "Force on one jaw against the travel of each jaw. Where jaws close on a coarser mesh, the curve "
@@ -293,4 +344,6 @@ PLATES = (
 def figures(study: Study) -> Iterator[Plate]:
     """All figures of a study."""
     for name, title, caption, draw in PLATES:
+        if draw is plot_limits and not limits(study):
+            continue
         yield Plate(name, title, caption, draw(study))

@@ -17,6 +17,10 @@ FILE_UNIT = {"mN": ("N", 1e3), "1/mm": ("per_mm", 1.0)}
 """internal unit -> unit in files, and internal units in one of it; the others are the same"""
 ONSETS = (1.001, 100.0)
 """least and greatest stretch at which damage may be said to begin"""
+SAID_OF_NUMBERS = {"volume_above": " {:g} kPa", "holding_force": " at a friction of {:g}"}
+"""by the measure's name, how its number is put into words; that of others is an onset stretch"""
+FRICTIONS = (1e-4, 10.0)
+"""least and greatest coefficient of friction"""
 
 
 def _layer(value: Any, path: str, layers: tuple[str, ...]) -> str:
@@ -42,10 +46,18 @@ def _onset_stretch(value: Any, path: str, _layers: tuple[str, ...]) -> float:
     return number(value, path, *ONSETS, "a stretch")
 
 
+def _friction(value: Any, path: str, _layers: tuple[str, ...]) -> float:
+    """A coefficient of friction. Raises SceneError."""
+    if value is None:
+        raise SceneError(f"{path} is missing: expected a coefficient of friction")
+    return number(value, path, *FRICTIONS, "a coefficient of friction")
+
+
 _READERS: dict[str, Callable[[Any, str, tuple[str, ...]], Any]] = {
     "layer": _layer,
     "stress": _stress,
     "onset_stretch": _onset_stretch,
+    "friction": _friction,
 }
 
 
@@ -90,10 +102,11 @@ def in_words(measure: Measure) -> str:
     if measure.name not in {factory.__name__ for factory in jc.MEASURES}:
         return str(measure)
     numbers = [a for a in measure.arguments if isinstance(a, float)]
-    above = [f" {a:g} kPa" for a in numbers if measure.name == jc.volume_above.__name__]
-    onset = [f" (onset stretch {a:g})" for a in numbers if not above]
     layer = [f" of the {a}" for a in measure.arguments if isinstance(a, str)][-1:]
-    return "".join([measure.name.replace("_", " "), *above, *layer, *onset])
+    said = SAID_OF_NUMBERS.get(measure.name, " (onset stretch {:g})")
+    above = [said.format(a) for a in numbers]
+    before, behind = (above, []) if measure.name == jc.volume_above.__name__ else ([], above)
+    return "".join([measure.name.replace("_", " "), *before, *layer, *behind])
 
 
 def read_measure(

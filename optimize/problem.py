@@ -28,6 +28,8 @@ class Constraint:
     """internal units"""
     relative: bool = False
     """True: the bounds are multiples of the reference clamp's value"""
+    reference: float | None = None
+    """the reference clamp's value, of bounds that were multiples of it"""
 
     @property
     def sides(self) -> tuple[tuple[float, float], ...]:
@@ -145,7 +147,7 @@ def _absolute(c: Constraint, reference: Result) -> Constraint:
         return c
     value = reference.measure(c.measure)
     bound = lambda side: rounded(side * value) if math.isfinite(side) else side  # noqa: E731
-    return Constraint(c.measure, bound(c.lower), bound(c.upper))
+    return Constraint(c.measure, bound(c.lower), bound(c.upper), reference=value)
 
 
 def require_consistent(problem: DesignProblem) -> None:

@@ -130,8 +130,9 @@ def warning(study: Study | Front) -> str | None:
     best = next(e for e in study.evaluations if e.design is study.best_design)
     if best.violation(study.problem) > FEASIBLE:
         return f"no design met the constraints; the best violates them by {best.violation(study.problem):.1%}"
-    if study.verification is not None and not study.verification.survives:
-        return study.verification.sentence
+    checked = study.verification
+    if checked is not None and (checked.missed or not checked.survives):
+        return checked.sentence
     return None
 
 

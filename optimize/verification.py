@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from jaxclamp import Failure, Measure, Result, Scene, clamp, neighbours, replace
-from optimize.gains import Gain
+from jaxclamp import Estimate, Failure, Measure, Result, Scene, clamp, neighbours, replace
+from optimize.gains import Gain, with_error
+from optimize.named_measures import in_words
 from optimize.price import Compared
-from optimize.problem import DesignProblem
+from optimize.problem import Constraint, DesignProblem
+from optimize.record import FEASIBLE
 
 STIFFER = 2.0
 """contact stiffness times, and smoothing divided by, this"""
@@ -42,6 +44,8 @@ class Verification:
     """the same clamps with their errors on the study's own model; None: no errors are known"""
     after: Compared | None = None
     """on the finer model"""
+    missed: tuple[str, ...] = ()
+    """what of the constraints the best design does not keep there, a sentence each"""
 
     @property
     def gain_before(self) -> Gain:
@@ -76,6 +80,7 @@ class Verification:
             verdict = "there was no gain to lose"
         model = f"{self.elements} elements with harder contact"
         said = f"{verdict} on {model}: best against start is {self.gain}; before, it was {self.gain_before}"
+        said = "; ".join((said, *self.missed))
         now, before = (c and c.gain("reference") for c in (self.after, self.before))
         return said if now is None else f"{said}. Best against reference is {now}; before, it was {before}"
 
@@ -92,6 +97,7 @@ class Verification:
             "gain_error": None if gain is None else gain.error,
             **({} if self.after is None else self.after.to_dict()),
             "survives": self.survives,
+            "missed": list(self.missed),
             "elements": self.elements,
         }
         return {**blocks, **said, "failure": self.failure}
@@ -109,7 +115,8 @@ def verify(
     """
     fine: dict[str, float | None] = dict.fromkeys(results)
     final: dict[str, dict[str, Any] | None] = dict.fromkeys(results)
-    estimates = {}
+    estimates, limited = {}, {}
+    constrained = tuple(c.measure for c in problem.constraints)
     failure, elements = None, 0
     for name, result in results.items():
         try:
@@ -120,8 +127,41 @@ def verify(
         fine[name], final[name] = found.measure(problem.objective), found.final
         elements = found.model.mesh.n_cells
         if measures:
-            estimates[name] = neighbours(found).estimates(measures)
+            near = neighbours(found)
+            estimates[name] = near.estimates(measures)
+            limited[name] = near.estimates(constrained) if name in ("best", "reference") else {}
     coarse = {name: result.measure(problem.objective) for name, result in results.items()}
     after = Compared(problem.objective, estimates) if measures else None
     unit = problem.objective.unit
-    return Verification(coarse, fine, final, failure, elements, unit, before, after)
+    missed = tuple(
+        said
+        for c in problem.constraints
+        if "best" in limited and (said := miss(c, limited["best"], limited.get("reference")))
+    )
+    return Verification(coarse, fine, final, failure, elements, unit, before, after, missed)
+
+
+def miss(
+    c: Constraint, best: dict[Measure, Estimate], reference: dict[Measure, Estimate] | None
+) -> str | None:
+    """In a sentence, that the best design is beyond a bound by more than its error; None if it is not.
+
+    A bound that is relative to the reference is so on the same model.
+    """
+    value = best[c.measure]
+    for side, sign in c.sides:
+        bound = Estimate(side, dict.fromkeys(value.sources, 0.0))
+        if c.reference is not None:
+            if not reference or c.reference == 0.0:
+                continue
+            bound = _times(reference[c.measure], side / c.reference)
+        left = value - bound
+        if -sign * left.value > FEASIBLE * c.scale + (left.error or 0.0):
+            amount = with_error(abs(left.value), left.error, c.measure.unit)
+            return f"there the {in_words(c.measure)} is beyond its bound of {bound.value:.4g} by {amount}"
+    return None
+
+
+def _times(found: Estimate, factor: float) -> Estimate:
+    parts = {name: None if part is None else factor * part for name, part in found.sources.items()}
+    return Estimate(factor * found.value, parts)

@@ -95,6 +95,24 @@ def mean_contact_pressure() -> Measure:
     return Measure("mean_contact_pressure", "kPa", _mean_contact_pressure)
 
 
+def jaw_contact_area() -> Measure:
+    """Area of one jaw's contact with the wall at the stop, mm^2, smoothly counted."""
+    return Measure("jaw_contact_area", "mm2", _contact_area)
+
+
+def holding_force(friction: float) -> Measure:
+    """Greatest force along the artery that the jaws could hold by friction at the stop, mN: Coulomb's bound.
+
+    friction times the contact pressure's integral over both jaws; nothing rubs in the model, so it is a bound
+    on what a grip could carry, not a load of the scene. friction: coefficient between jaw and wall, such as
+    0.03 to 0.06 of endothelium on polished glass (Dunn et al., Tribol Lett 27 (2007) 233). Raises ValueError
+    if it is not positive.
+    """
+    if not 0.0 < friction < float("inf"):
+        raise ValueError(f"friction = {friction!r}: expected a coefficient above 0")
+    return Measure("holding_force", "mN", _holding_force, (float(friction),))
+
+
 def smooth_peak_contact_pressure() -> Measure:
     """Smooth maximum of the contact pressure at the stop, kPa."""
     return Measure("smooth_peak_contact_pressure", "kPa", _smooth_peak_contact_pressure)
@@ -141,6 +159,8 @@ MECHANICAL: tuple[Callable[..., Measure], ...] = (
     lumen_width,
     lumen_area,
     mean_contact_pressure,
+    jaw_contact_area,
+    holding_force,
     smooth_peak_contact_pressure,
     volume_above,
     stored_energy,
@@ -233,6 +253,15 @@ def contact_of_a_jaw(e: Equilibria) -> tuple[Array, Array]:
 
 def _mean_contact_pressure(e: Equilibria) -> Array:
     return contact_of_a_jaw(e)[0]
+
+
+def _contact_area(e: Equilibria) -> Array:
+    return contact_of_a_jaw(e)[1]
+
+
+def _holding_force(e: Equilibria, friction: float) -> Array:
+    pressure, area = contact_points(e)
+    return 2.0 * friction * e.marks.symmetry.parts_of_a_jaw * jnp.sum(pressure * area)
 
 
 def contact_points(e: Equilibria) -> tuple[Array, Array]:

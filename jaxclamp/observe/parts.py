@@ -28,7 +28,12 @@ from jaxclamp.scenes.wording import shortened
 
 BASES = {"jaw": Jaw, "law": Material, "stop": Stop}
 """what a file may have records of"""
-ARGUMENTS: dict[str, Any] = {"layer": "media", "stress": 1.0, "onset_stretch": ONSET_STRETCH}
+ARGUMENTS: dict[str, Any] = {
+    "layer": "media",
+    "stress": 1.0,
+    "onset_stretch": ONSET_STRETCH,
+    "friction": 0.05,
+}
 """what a study file can give to a measure, each with an example (stress: kPa)"""
 LARGEST_FILE = 1_000_000
 """bytes"""

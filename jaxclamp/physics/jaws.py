@@ -128,6 +128,8 @@ class Spline(Face):
     """control values of h' at the stations beside the middle; the last is the slope at the end, (n,)"""
     edge_radius: Array = quantity("mm", 0.0, 1e3, open_lower=True)
     """radius of the rounding from the profile's end to the side"""
+    profile_residual: Array | None = quantity("mm", 0.0, 1e3, default=None)
+    """how far the farthest point of the file is off that the profile was fitted to; moves nothing"""
     teeth: Teeth | None = None
     crown: Crown | None = None
 

@@ -17,7 +17,7 @@ from jaxclamp.core.failures import BadKey, SceneError
 from jaxclamp.core.parts import own_parts
 from jaxclamp.core.surroundings import require_fit
 from jaxclamp.physics.jaws import Jaw
-from jaxclamp.scenes import schema
+from jaxclamp.scenes import profile, schema
 from jaxclamp.scenes.checks import check, check_laws
 from jaxclamp.scenes.fidelity import COUNTS, FIDELITIES, mesh_for
 from jaxclamp.scenes.fitting import fitting_contact
@@ -171,6 +171,9 @@ def _expand(table: dict[str, Any], source: str) -> None:
     if isinstance(clamp, dict):
         for key in ("jaw", "upper", "lower"):
             _put_in(clamp, key, "jaw", f"clamp.{key}", source)
+            if isinstance(jaw := clamp.get(key), dict):
+                with _refusals(source):
+                    clamp[key] = profile.fitted(jaw, f"clamp.{key}")
 
 
 def _put_in(owner: dict[str, Any], key: str, kind: str, where: str, source: str) -> None:

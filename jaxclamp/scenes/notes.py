@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxclamp.core.records import UNIT_FACTOR
+from jaxclamp.physics.jaws import Spline
 from jaxclamp.scenes import schema
 from jaxclamp.scenes.checks import closed
 from jaxclamp.scenes.scene import Scene
@@ -75,7 +76,7 @@ solid (Hong, Zhao & Suo, Appl Phys Lett 95 (2009) 111901)"""
 def notes(scene: Scene) -> list[str]:
     """What of a scene is far from sourced ranges of arteries, a sentence each."""
     artery = scene.artery
-    said = [*_of(artery, "artery"), *_nesting(scene)]
+    said = [*_of(artery, "artery"), *_nesting(scene), *_profiles(scene)]
     for i, layer in enumerate(artery.layers):
         path = f"artery.layers[{i}]"
         said += [*_of(layer, path), *_of(layer.material, f"{path}.material")]
@@ -150,6 +151,17 @@ def _in_other_unit(value: float, unit: str, known: Sourced) -> str:
         if target == unit and known.lower <= value * factor <= known.upper:
             return f"; if it is in {spoken(other)}, write {value * factor:.4g}"
     return ""
+
+
+def _profiles(scene: Scene) -> Iterator[str]:
+    """Of jaws that were fitted to the points of a file."""
+    for name, jaw in scene.clamp.kinds.items():
+        if isinstance(jaw, Spline) and jaw.profile_residual is not None:
+            off = 1e3 * float(jaw.profile_residual)
+            yield (
+                f"clamp.{name}: a spline of {np.size(jaw.slopes)} slopes stands for the points of a file, of "
+                f"which the farthest is {off:.2g} um off"
+            )
 
 
 def _nesting(scene: Scene) -> Iterator[str]:

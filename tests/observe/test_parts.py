@@ -312,7 +312,7 @@ BAD = {
     "an argument": (
         PARTS.replace("def weighed_force()", "def weighed_force(weight)"),
         "others.py: measure weighed_force takes weight: "
-        "a study file can give layer, stress, onset_stretch only",
+        "a study file can give layer, stress, onset_stretch, friction only",
     ),
     "no measure": (
         PARTS.replace("return 0.5 * jc.clamp_force() + 0.1 * jc.N", "return 3"),

@@ -467,7 +467,7 @@ def test_every_named_measure_is_a_measure_of_a_result():
     problem, unit = one_slope(), {"mN": "N", "1/mm": "per_mm"}
     result = jc.clamp(problem.scene)
     for key, found in named().items():
-        given = {"layer": "media", "stress": 20.0, "onset_stretch": 1.27}
+        given = {"layer": "media", "stress": 20.0, "onset_stretch": 1.27, "friction": 0.05}
         measure = found.factory(**{name: given[name] for name in found.arguments})
         assert math.isfinite(result.measure(measure)), key
         assert key.endswith(unit.get(measure.unit, measure.unit))
@@ -483,6 +483,12 @@ def test_measures_agree_with_the_record():
     assert result.measure(PEAK) == pytest.approx(final["smooth_peak_axial_stress_kPa"]["media"], rel=1e-9)
     assert result.measure(jc.mean_contact_pressure()) == pytest.approx(final["mean_contact_pressure_kPa"])
     assert result.measure(jc.jaw_half_width()) == 3.0
+    area = result.measure(jc.jaw_contact_area())
+    assert area == pytest.approx(final["contact_area_mm2"], rel=1e-9)
+    # the mean pressure is the integral over both jaws over the area of both
+    held = 2.0 * 0.05 * area * result.measure(jc.mean_contact_pressure())
+    assert result.measure(jc.holding_force(0.05)) == pytest.approx(held, rel=1e-9)
+    assert held >= 2.0 * 0.05 * result.measure(jc.clamp_force())  # a face that is bent presses sideways, too
 
 
 @pytest.mark.slow
