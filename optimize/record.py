@@ -36,7 +36,7 @@ class Evaluation:
         """Largest relative violation of a constraint; 0 if all hold."""
         pairs = zip(problem.constraints, self.values[1:], strict=True)
         falls = -problem.climbs(self.design)
-        return max([0.0, *falls, *(constraint.violation(float(value)) for constraint, value in pairs)])
+        return max([0.0, *map(float, falls), *(c.violation(float(value)) for c, value in pairs)])
 
 
 @dataclasses.dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import types
 
@@ -11,10 +12,11 @@ import pytest
 import jaxclamp as jc
 from jaxclamp.show.report import STYLE
 from optimize.gains import Gain
+from optimize.problem import Constraint
 from optimize.record import Evaluation, Record
 from optimize.study import solved_cold
 from optimize.study_file import load_study
-from optimize.verification import Verification, verify
+from optimize.verification import Verification, miss, verify
 
 
 def verification(coarse, fine, unit="kPa"):
@@ -73,7 +75,7 @@ def test_a_finer_model_that_cannot_be_solved_leaves_the_study(error, monkeypatch
 
     monkeypatch.setattr("optimize.verification.clamp", clamp)
     result = types.SimpleNamespace(scene=jc.load_scene("human-lad"), measure=lambda measure: 3.0)
-    problem = types.SimpleNamespace(objective=jc.clamp_force())
+    problem = types.SimpleNamespace(objective=jc.clamp_force(), constraints=())
     found = verify(problem, {"start": result, "best": result})
     assert found.sentence == f"the finer model was not solved: best: {error}"
 
@@ -119,3 +121,37 @@ def test_a_long_number_stays_inside_its_box():
     box, big = rules[".headlines div"], rules[".headlines b"]
     assert (box["min-width"], box["overflow-wrap"]) == ("0", "anywhere")
     assert not {"white-space", "overflow-wrap", "word-break", "width", "min-width"} & set(big)
+
+
+# --- bounds on the finer model ----------------------------------------------------------------------
+
+FORCE = jc.clamp_force()
+
+
+def known(value, off):
+    return {FORCE: jc.Estimate(value, {"mesh": off})}
+
+
+@pytest.mark.parametrize(
+    ("constraint", "best", "reference", "said"),
+    [
+        # a bound of one's own: 110 is 10 beyond 100; that is more than its error of 4, no more than one of 12
+        (Constraint(FORCE, upper=100.0), (110.0, 4.0), None, "beyond its bound of 100 by 10 ± 4 mN"),
+        (Constraint(FORCE, upper=100.0), (110.0, 12.0), None, None),
+        (Constraint(FORCE, lower=100.0), (90.0, 4.0), None, "beyond its bound of 100 by 10 ± 4 mN"),
+        (Constraint(FORCE, 80.0, 100.0), (90.0, 0.0), None, None),
+        # the reference's, which was 100 on the study's model: errors in common cancel
+        (Constraint(FORCE, upper=100.0, reference=100.0), (110.0, 4.0), (108.0, 3.0), "of 108 by 2 ± 1 mN"),
+        (Constraint(FORCE, upper=100.0, reference=100.0), (110.0, 4.0), (111.0, 3.0), None),
+        # half of the reference's
+        (Constraint(FORCE, upper=50.0, reference=100.0), (60.0, 2.0), (110.0, 2.0), "of 55 by 5 ± 1 mN"),
+        (Constraint(FORCE, upper=50.0, reference=100.0), (60.0, 2.0), None, None),
+    ],
+)
+def test_a_bound_that_the_finer_model_does_not_keep_is_told(constraint, best, reference, said):
+    found = miss(constraint, known(*best), None if reference is None else known(*reference))
+    assert found is None if said is None else said in found
+    checked = verification((2.0, 1.0), (2.0, 1.0))
+    checked = dataclasses.replace(checked, missed=() if found is None else (found,))
+    assert (found or "the gain survives") in checked.sentence
+    assert checked.to_dict()["missed"] == ([] if found is None else [found])

@@ -102,6 +102,24 @@ def test_a_singular_matrix_is_refused(name):
             solve()
 
 
+def test_a_soft_direction_is_answered_as_well_as_float64_can(name):
+    """An eigenvalue of 1e-5 beside others up to 1e6: rounding alone leaves more than 1e-8 of b."""
+    n, rng = 60, np.random.default_rng(3)
+    Q = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    dense = Q @ np.diag([1e-5, *np.geomspace(1.0, 1e6, n - 1)]) @ Q.T
+    dense = 0.5 * (dense + dense.T)
+    upper = sp.csr_matrix(np.triu(dense))
+    upper.sort_indices()
+    solver = LinearSolver(Pattern(upper.indptr, upper.indices), name)
+    solver.factor(upper.data)
+    b = 1e-5 * Q[:, :1]
+    x = solver.solve(b)
+    left = np.linalg.norm(dense @ x - b) / np.linalg.norm(b)
+    assert left < 1e-4
+    np.testing.assert_allclose(x, Q[:, :1], atol=1e-3)
+    assert solver.name == name
+
+
 @pytest.mark.skipif(len(BACK_END_NAMES) < 2, reason="needs two back ends")
 def test_a_back_end_that_solves_wrongly_hands_over(monkeypatch):
     pattern, values, dense = indefinite(100, 0.2, 7)
