@@ -26,7 +26,7 @@ RELATIVE_RESIDUAL = 1e-8
 """A solution with a larger ||K x - b|| / ||b|| is refused, unless it is as good as float64 can tell:"""
 ROUNDING, LEAST_ACCURACY = 100.0 * np.finfo(float).eps, 1e-4
 """||K x - b|| may be the first times max |K| ||x||, up to the second times ||b||: an artery that little but
-itself holds sideways answers a small force with a large x, whose rounding alone is more than the limit above"""
+itself holds sideways answers a small force with a large x, and its rounding alone is more than that limit"""
 
 
 class BackEnd(Protocol):
