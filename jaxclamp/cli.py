@@ -1,4 +1,4 @@
-"""The command line: `jaxclamp show`, `run`, `optimise`, `compare`, `fit`, `accuracy` and `presets`.
+"""The command line: `jaxclamp show`, `run`, `optimise`, `compare`, `fit`, `sweep`, `accuracy` and `presets`.
 
 Exit codes: 0 done; 2 the input is wrong; 3 no converged solution; 4 the machine refused; 130
 interrupted; 143 terminated. What went wrong is one sentence on standard error. Results go to standard output,
@@ -234,8 +234,7 @@ def compare(
         ),
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="./SCENE-compared"),
+        Path | None, typer.Option("--out", metavar="DIR", help="Default: ./SCENE-compared.")
     ] = None,
     fidelity: FidelityOption = None,
     overrides: SetOption = None,
@@ -289,10 +288,7 @@ def fit(
     ] = "radius",
     starts: Annotated[int, typer.Option("--starts", metavar="N", help="From how many starts.")] = 20,
     seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of random starts.")] = 0,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="./SCENE-fit"),
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Default: ./SCENE-fit.")] = None,
     overrides: SetOption = None,
     parts: ImportOption = None,
     as_json: JsonOption = False,
@@ -323,11 +319,41 @@ def fit(
 
 
 @app.command()
+def sweep(
+    file: Annotated[str, typer.Argument(metavar="SWEEP.toml", help="A scene, and what is varied.")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Default: ./SWEEP-sweep.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Solve what is missing in that folder.")] = False,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Default: one a core.")] = None,
+    scheduler: Annotated[str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of dask.")] = None,
+    parts: ImportOption = None,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> int:
+    """Solve many scenes, as independent jobs on dask; a second start solves what is missing."""
+    from optimize.sweep import Cluster, run_sweep
+    from optimize.sweep_file import load_sweep
+    from optimize.sweep_report import lines, write_sweep
+
+    import_files(parts)
+    asked = load_sweep(file)
+    folder = out or Path(f"{Path(file).stem}-sweep")
+    folders.check(folder)
+    with console.progress(quiet) as progress:
+        tell = progress if callable(progress) else None
+        rows = run_sweep(asked, folder, Cluster(workers, scheduler), resume, tell)
+    files = write_sweep(asked, rows, folder)
+    if as_json:
+        typer.echo(console.as_json(rows))
+    elif not quiet:
+        typer.echo("\n".join([asked.title, *lines(asked, rows), "", *(f"  open {path}" for path in files)]))
+    return DONE
+
+
+@app.command()
 def accuracy(
     scene: SceneArgument,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for the tables.", show_default="./SCENE-accuracy"),
+        Path | None, typer.Option("--out", metavar="DIR", help="Default: ./SCENE-accuracy.")
     ] = None,
     fidelity: FidelityOption = None,
     overrides: SetOption = None,
