@@ -187,10 +187,7 @@ def run(
 @app.command()
 def optimise(
     study: Annotated[str, typer.Argument(metavar="STUDY", help="A TOML file or the name of a preset.")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder for the study.", show_default="./STUDY-study"),
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Default: ./STUDY-study.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the study in that folder.")] = False,
     parts: ImportOption = None,
     as_json: JsonOption = False,

@@ -64,8 +64,13 @@ def plot_scatter(rows: list[dict[str, Any]], keys: list[str]) -> Picture | None:
                 markersize=3.5,
             )
             last = i == len(figures) - 1
-            dress(grid[i, j], key.rpartition(".")[2] if last else "", "" if j else figure)
+            dress(grid[i, j], key.rpartition(".")[2] if last else "", "" if j else label(figure))
     return picture
+
+
+def label(figure: str) -> str:
+    """A figure as the label of an axis."""
+    return f"peak axial stress, {figure.removeprefix(PEAK)} (kPa)" if figure.startswith(PEAK) else figure
 
 
 def counts(rows: list[dict[str, Any]]) -> str:
