@@ -25,7 +25,8 @@ def imported(package: str) -> set[str]:
 
 def declared() -> set[str]:
     project = PROJECT["project"]
-    asked = [*project["dependencies"], *project["optional-dependencies"]["mma"]]
+    extras = project["optional-dependencies"]
+    asked = [*project["dependencies"], *extras["mma"], *extras["sweep"]]
     return {re.split(r"[<>=; ]", line)[0] for line in asked}
 
 

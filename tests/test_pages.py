@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 import jaxclamp as jc
 from jaxclamp.cli import app
 from jaxclamp.scenes.presets import preset
+from optimize.sweep_file import load_sweep
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -69,6 +70,11 @@ def test_commands_are_commands(line, tmp_path, monkeypatch):
     assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
     if command == "optimise":
         preset(rest[0])
+        return
+    if command == "sweep":
+        page = Path(__file__).parents[1] / "docs" / "sweep.md"
+        Path(rest[0]).write_text(next(text for text in blocks(page, "toml") if "[[vary]]" in text))
+        assert len(load_sweep(rest[0]).jobs) == 100
         return
     if command == "fit":  # its files are the reader's own
         rest = rest[rest.index("--scene") + 1 :]
