@@ -21,7 +21,7 @@ from jaxclamp.scenes.presets import KINDS, preset
 from jaxclamp.scenes.presets import presets as shipped
 from jaxclamp.show import console, folders
 from jaxclamp.show.refusals import refusal
-from jaxclamp.show.steps import import_files, load, solve, write
+from jaxclamp.show.steps import import_files, load, load_uncertain, propagate, solve, told, write
 
 DONE, NOT_CONVERGED = 0, 3
 """exit codes; failures bring their own"""
@@ -44,28 +44,18 @@ FidelityOption = Annotated[
         show_default="standard",
     ),
 ]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="KEY=VALUE", help="Override one key, e.g. clamp.jaw.radius_mm=1.5; repeatable."
-    ),
-]
-ImportOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--import",
-        metavar="FILE.py",
-        help="Python file of your own jaws, laws, stops and measures, which files may then name; repeatable.",
-    ),
-]
+SET = "Override one key, e.g. clamp.jaw.radius_mm=1.5; repeatable."
+SetOption = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help=SET)]
+IMPORT = "Python file of your own jaws, laws, stops and measures, which files may then name; repeatable."
+ImportOption = Annotated[list[str] | None, typer.Option("--import", metavar="FILE.py", help=IMPORT)]
 OutOption = Annotated[
     Path | None,
     typer.Option("--out", metavar="DIR", help="Folder for the results.", show_default="./SCENE-result"),
 ]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")
-]
+JSON = "Print one JSON object on standard output, nothing else."
+JsonOption = Annotated[bool, typer.Option("--json", help=JSON)]
 FREE = "Fit this number, such as media.k1, and those named alike; default: every constant but bulk."
+UNCERTAIN = "What of the scene is uncertain: a TOML file of parameters, or fit.json."
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 
 
@@ -100,9 +90,6 @@ def _fail(sentence: str, code: int) -> int:
     if sentence:
         typer.echo(f"jaxclamp: {' '.join(sentence.split())}", err=True)
     return code
-
-
-# ---------------------------------------------------------------------------------- commands
 
 
 def _print_version(wanted: bool) -> None:
@@ -154,6 +141,8 @@ def run(
     out: OutOption = None,
     fidelity: FidelityOption = None,
     overrides: SetOption = None,
+    uncertain: Annotated[Path | None, typer.Option("--uncertainty", metavar="FILE", help=UNCERTAIN)] = None,
+    samples: Annotated[int, typer.Option("--samples", metavar="N", min=0, help="Solve N drawn scenes.")] = 0,
     parts: ImportOption = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
@@ -161,6 +150,7 @@ def run(
     """Clamp an artery: stress-free, load-free, physiological, clamped to the stop."""
     import_files(parts)
     loaded = load(scene, fidelity, overrides, quiet)
+    covariance = load_uncertain(uncertain, samples, loaded)
     folder = out if out is not None or as_json else Path(f"{Path(scene).stem}-result")
     if folder is not None:
         folders.check_results(folder, scene)
@@ -170,10 +160,12 @@ def run(
     _tell(unlikely, quiet)
     result, failure = solve(loaded, quiet)
     files = write(result, folder, quiet) if result is not None and folder is not None else []
+    spread = None if covariance is None or failure else propagate(result, covariance, samples, folder, quiet)
     if result is not None and as_json:
-        typer.echo(console.as_json(result.to_dict()))
+        more = {} if spread is None else {"uncertainty": spread.to_dict(result.errors)}
+        typer.echo(console.as_json(result.to_dict() | more))
     elif result is not None and not quiet:
-        typer.echo("\n".join(console.summary(result.to_dict(), files)))
+        typer.echo("\n".join([*console.summary(result.to_dict(), files), *told(spread, result)]))
     if result is not None:
         _tell([note for note in result.to_dict().get("notes", ()) if note not in unlikely], quiet)
     if failure is not None:

@@ -68,3 +68,38 @@ def write(result: Any, folder: Path, quiet: bool) -> list[Path]:
 
     with console.progress(quiet) as progress:
         return list(write_outputs(result, folder, progress if callable(progress) else None))
+
+
+def load_uncertain(file: Path | None, samples: int, scene: Scene) -> Any:
+    """What is uncertain of a scene, by a file; None without one. Raises SceneError."""
+    from jaxclamp.core.failures import SceneError
+    from jaxclamp.trust.uncertainty import load_covariance
+
+    if file is None:
+        if samples:
+            raise SceneError("--samples: there is nothing to draw them from without --uncertainty FILE")
+        return None
+    return load_covariance(file, scene)
+
+
+def propagate(result: Any, covariance: Any, samples: int, folder: Path | None, quiet: bool) -> Any:
+    """Standard deviations of a result's figures, written beside its other outputs."""
+    from jaxclamp.core.progress import Progress
+    from jaxclamp.show.uncertainty_report import write_uncertainty
+    from jaxclamp.trust.uncertainty import sampled, uncertainty
+
+    found = uncertainty(result, covariance)
+    if samples:
+        with console.progress(quiet) as progress:
+            hears = progress if callable(progress) else lambda event: None
+            found = sampled(found, result, samples, tell=lambda f, said: hears(Progress("sampling", f, said)))
+    if folder is not None:
+        write_uncertainty(found, result, folder)
+    return found
+
+
+def told(found: Any, result: Any) -> list[str]:
+    """Lines of a terminal on what is uncertain."""
+    from jaxclamp.show.uncertainty_report import lines
+
+    return [] if found is None else lines(found, result)
