@@ -9,6 +9,7 @@ import csv
 import dataclasses
 import hashlib
 import itertools
+import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp import Failure, Scene, SceneError, dump_scene, load_scene
+from jaxclamp import Failure, Scene, SceneError, dump_scene, load_scene, own_parts
 from jaxclamp.scenes.address import describe
 from jaxclamp.scenes.files import read_text
 from jaxclamp.scenes.schema import shown, toml_value
@@ -50,7 +51,7 @@ class Job:
     """from 1"""
     name: str
     """of its row, if that has one"""
-    varied: dict[str, float | str]
+    varied: dict[str, Any]
     """what is its own, by key, in the units of scene files"""
     text: str | None
     """the complete scene; None for one that is refused"""
@@ -58,6 +59,8 @@ class Job:
     """why there is none"""
     shape: tuple[int, ...] = ()
     """of its mesh: jobs alike share compiled programs"""
+    own: str = ""
+    """digests of the files that its own parts come from"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +79,9 @@ class Sweep:
     @property
     def digest(self) -> str:
         """A word that changes with any scene."""
-        parts = [f"{job.number} {job.name} {job.varied} {job.text or job.refusal}" for job in self.jobs]
+        parts = [
+            f"{job.number} {job.name} {job.varied} {job.text or job.refusal} {job.own}" for job in self.jobs
+        ]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
@@ -127,7 +132,8 @@ def _job(
         found = load_scene(scene, [*fixed, *(f"{k}={toml_value(v)}" for k, v in varied.items())], fidelity)
         mesh = found.mesh
         shape = (mesh.circumferential, mesh.axial, *mesh.radial)
-        return Job(place, name, varied, dump_scene(found), shape=shape)
+        own = " ".join(f"{part['part']} {part['sha256']}" for part in own_parts(found))
+        return Job(place, name, varied, dump_scene(found), shape=shape, own=own)
     except SceneError as error:
         return Job(place, name, varied, None, str(error))
 
@@ -136,9 +142,7 @@ def _beside(folder: Path, scene: str) -> str | Path:
     return folder / scene if Path(scene).suffix == ".toml" else scene
 
 
-def _varied(
-    table: dict[str, Any], base: Scene, folder: Path
-) -> Iterator[tuple[str, str, dict[str, float | str]]]:
+def _varied(table: dict[str, Any], base: Scene, folder: Path) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Name, scene and what is its own of every job."""
     lists, ranges = _vary(table, base)
     rows = _rows(table["csv"], folder) if "csv" in table else iter([("", "", {})])
@@ -168,6 +172,10 @@ def _vary(table: dict[str, Any], base: Scene) -> tuple[dict[str, list[Any]], dic
             values = item["values"]
             if not isinstance(values, list) or not values:
                 raise SceneError(f"{path}.values = {shown(values)}: expected a list of values")
+            try:
+                json.dumps(values)
+            except TypeError:
+                raise SceneError(f"{path}.values = {shown(values)}: dates and times are no values") from None
             lists[key] = values
         elif set(item) == {"key", "lower", "upper"}:
             describe(base, key)  # a float of the scene
@@ -198,7 +206,7 @@ def _samples(table: dict[str, Any], ranges: dict[str, tuple[float, float]]) -> l
     return [dict(zip(ranges, map(float, row), strict=True)) for row in drawn]
 
 
-def _rows(file: Any, folder: Path) -> Iterator[tuple[str, str, dict[str, float | str]]]:
+def _rows(file: Any, folder: Path) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Name, scene and keys with values of each row of a CSV file."""
     if not isinstance(file, str):
         raise SceneError(f"csv = {shown(file)}: expected the path of a CSV file")

@@ -11,8 +11,8 @@ from jaxclamp.pictures.plots import Plate, png
 from jaxclamp.pictures.plots.style import AXIAL, Picture, dress
 from jaxclamp.show.report import document, figure_section, number, section, table
 from optimize.journal import write_bytes, write_whole
-from optimize.sweep import DONE, RESULTS
 from optimize.sweep_file import Sweep
+from optimize.sweep_folder import DONE, RESULTS
 
 PAGE, FIGURE = "report.html", "scatter.png"
 MOST_ROWS, MOST_VARIED = 200, 6
