@@ -11,9 +11,9 @@ import itertools
 import os
 import time
 import uuid
-from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,7 @@ MOST_TRIES, PATIENCE = 3, 10.0
 
 
 class NoDask(Failure):
-    """The packages of the extra are not there."""
+    """The packages of the extra, or the scheduler, are not there."""
 
     exit_code = 2
 
@@ -142,6 +142,7 @@ def connected(cluster: Cluster) -> Iterator[tuple[Any, str | None]]:
             memory_limit=0,
             dashboard_address="127.0.0.1:0",  # any port: a fixed one may be taken, which dask would tell
             silence_logs=50,
+            preload=["optimize.sweep_worker"],
         ) as local,
         Client(local) as client,
     ):

@@ -87,6 +87,7 @@ def place_of(folder: Path, job: Job) -> Path:
 
 
 def status_of(folder: Path, job: Job) -> str | None:
+    """How a job ended, by its folder; None if it is to be solved yet."""
     return _read(place_of(folder, job) / RECORD).get("status")
 
 

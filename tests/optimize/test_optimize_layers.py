@@ -39,6 +39,7 @@ LEVEL = {
     "comparison": 2,
     "comparison_report": 7,
     "sweep_file": 1,
+    "sweep_worker": 0,
     "sweep_folder": 2,
     "sweep": 3,
     "sweep_report": 7,
