@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import logging
 import os
 import time
 import uuid
@@ -36,8 +37,8 @@ from optimize.sweep_folder import (
     write_job,
 )
 
-MOST_TRIES, PATIENCE = 3, 10.0
-"""times that a job is sent, or that a lost scheduler is looked for; seconds, each time"""
+MOST_TRIES, PATIENCE = 3, 30.0
+"""times that a job is sent, or that a scheduler may be lost in a row; seconds that one is looked for"""
 
 
 class NoDask(Failure):
@@ -125,8 +126,9 @@ def connected(cluster: Cluster) -> Iterator[tuple[Any, str | None]]:
     from distributed import Client, LocalCluster
 
     if cluster.scheduler is not None:
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # said in words of ours
         try:
-            client = Client(cluster.scheduler, timeout=30)
+            client = Client(cluster.scheduler, timeout=PATIENCE)
         except (OSError, ValueError) as error:
             raise NoDask(f"--scheduler {cluster.scheduler}: no scheduler answers there ({error})") from None
         with client:
@@ -172,21 +174,16 @@ class _Driver:
         """jobs of each process, by its address"""
         self.name = f"jaxclamp-{uuid.uuid4().hex[:12]}"
         """dask takes tasks of one key for the same: keys of this start are no other's"""
-        self.serial = itertools.count(1)
+        self.serial, self.lost = itertools.count(1), 0
 
     def run(self, jobs: list[Job]) -> None:
         """Solve the jobs, those of one mesh after another."""
         self.waiting.extend(sorted(jobs, key=lambda job: job.shape))
         self.tell(Progress("sweep", 0.0, f"{self.count} jobs"))
-        first = self.client
-        try:
-            self._listen()
-            while self.waiting or self.flying:
-                for job, record in self._answers():
-                    self._write(job, record)
-        finally:
-            if self.client is not first:
-                self.client.close()
+        self._listen()
+        while self.waiting or self.flying:
+            for job, record in self._answers():
+                self._write(job, record)
 
     def _answers(self) -> list[tuple[Job, dict[str, Any] | None]]:
         """Send jobs, and wait a little for answers; None for a job that is to be sent again."""
@@ -199,9 +196,10 @@ class _Driver:
                 wait(list(self.flying), timeout=1.0, return_when="FIRST_COMPLETED")
             ended = {future: self._answer(future) for future in list(self.flying) if future.done()}
             ended |= self._late(set(self.flying) - set(ended))
-        except (OSError, CancelledError, ClosedClientError) as error:
-            self._look_again(error)
+        except (OSError, CancelledError, ClosedClientError):
+            self._look_again()
             return []
+        self.lost = 0
         found = [(self.flying.pop(future), record) for future, record in ended.items()]
         for future in ended:
             self.started.pop(future.key, None)
@@ -260,21 +258,21 @@ class _Driver:
     def _begins(self, event: tuple[float, dict[str, str]]) -> None:
         self.started[event[1]["key"]] = event[1]["worker"], time.perf_counter()
 
-    def _look_again(self, error: BaseException) -> None:
-        """Have what flies wait again, and find the scheduler. Raises NoDask if it is gone."""
-        from distributed import Client
-
+    def _look_again(self) -> None:
+        """Have what flies wait again, while dask connects anew. Raises NoDask if it cannot."""
         self.waiting.extendleft(reversed(self.flying.values()))
         self.flying.clear()
-        for _ in range(MOST_TRIES if self.scheduler is not None else 0):
-            with suppress(Exception):
-                self.client.close(timeout=1)
-            with suppress(OSError):
-                self.client = Client(self.scheduler, timeout=PATIENCE)
-                self._listen()
-                return
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise NoDask(f"the scheduler is lost ({said}): {self.folder} has what is done; go on with --resume")
+        self.lost += 1
+        end = time.monotonic() + 2.0 * PATIENCE
+        time.sleep(1.0)
+        while self.client.status not in ("running", "closed") and time.monotonic() < end:
+            time.sleep(0.2)
+        if self.client.status != "running" or self.lost > MOST_TRIES:
+            where = self.scheduler or "this machine"
+            raise NoDask(
+                f"the scheduler at {where} is lost: go on with --resume, {self.folder} has what is done"
+            )
+        self._listen()
 
     def _write(self, job: Job, record: dict[str, Any] | None) -> None:
         """Write down what a job came to, or have it wait once more."""
