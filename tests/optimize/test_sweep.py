@@ -7,6 +7,7 @@ import json
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ from jaxclamp.cli import main
 from optimize import sweep as driver
 from optimize.sweep import Cluster, run_sweep, solve_job
 from optimize.sweep_file import load_sweep
+from optimize.sweep_report import page
 
 COARSE = ["mesh.circumferential=5", "mesh.axial=6", "mesh.radial=[2, 1]", "stop.occlusion=0.5"]
 HEAD = f"""
@@ -84,6 +86,7 @@ def test_rows_of_a_csv_file(tmp_path):
         ('csv = "none.csv"\n', "No such file"),
         ("[[vary]]\nkey = 'a'\n", "expected key with values, or key with lower and upper"),
         ("sample = 3\n" + RADII, "did you mean samples?"),
+        ("[[vary]]\nkey = 'artery.pressure_kPa'\nvalues = [2020-01-01]\n", "dates and times are no values"),
         ("time_limit_s = -1\n" + RADII, "time_limit_s = -1: expected a number from 1"),
     ],
 )
@@ -162,6 +165,24 @@ def test_a_folder_of_something_else_is_refused(tmp_path, solved):
         run_sweep(sweep, tmp_path / "there")
 
 
+def test_answers_of_other_versions_are_not_mixed(tmp_path, solved):
+    sweep, out = load_sweep(written(tmp_path, HEAD + RADII)), tmp_path / "out"
+    run_sweep(sweep, out)
+    head = json.loads((out / "sweep.json").read_text())
+    head["versions"]["jaxclamp"] = "0.0.1+abc"
+    (out / "sweep.json").write_text(json.dumps(head))
+    with pytest.raises(jc.BadFolder, match=r"holds answers of jaxclamp 0\.0\.1\+abc, and this is"):
+        run_sweep(sweep, out, resume=True)
+
+
+def test_lists_and_mixed_values_are_texts_in_the_table(tmp_path, solved):
+    text = '[[vary]]\nkey = "mesh.radial"\nvalues = [[2, 1], 4, true]\n'
+    sweep = load_sweep(written(tmp_path, HEAD + text))
+    rows = run_sweep(sweep, tmp_path / "out")
+    assert [row["mesh.radial"] for row in table(tmp_path / "out")] == ["[2, 1]", "4", "true"]
+    assert "[2, 1]" in page(sweep, rows, [])
+
+
 def test_without_the_extra_one_sentence_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "distributed", None)
     path = written(tmp_path, HEAD + RADII)
@@ -178,6 +199,71 @@ def test_a_job_has_the_answer_of_its_scene():
 
 
 # --- on dask ----------------------------------------------------------------------------------------
+
+
+class FakeFuture:
+    """A task that never ends."""
+
+    status = "pending"
+
+    def __init__(self, key):
+        self.key, self.cancelled = key, False
+
+    def done(self):
+        return False
+
+    def cancel(self):
+        self.cancelled = True
+
+    def release(self):
+        pass
+
+
+class FakeClient:
+    """A scheduler of one process that nothing reaches."""
+
+    def __init__(self):
+        self.sent, self.restarted = [], []
+
+    def scheduler_info(self, n_workers):
+        return {"workers": {"a": {}}}
+
+    def submit(self, task, key, pure):
+        self.sent.append(FakeFuture(key))
+        return self.sent[-1]
+
+    def restart_workers(self, addresses, timeout, raise_for_error):
+        self.restarted += addresses
+
+
+def started(tmp_path, client):
+    sweep = load_sweep(written(tmp_path, "time_limit_s = 1\n" + HEAD + RADII))
+    found = driver._Driver(sweep, tmp_path, client, None, 1, lambda event: None)
+    found.waiting.extend(sweep.jobs[:1])
+    found._send()
+    return found
+
+
+def test_no_two_starts_have_a_key_in_common(tmp_path):
+    """Dask answers a key that it knows with what it has, whoever asks."""
+    client = FakeClient()
+    for _ in range(2):
+        started(tmp_path, client)
+    assert len({future.key for future in client.sent}) == 2
+
+
+def test_time_spent_waiting_for_a_process_is_not_of_the_limit(tmp_path):
+    client = FakeClient()
+    begun = started(tmp_path, client)
+    (future,) = client.sent
+    time.sleep(1.1)
+    assert begun._late({future}) == {}
+    begun._begins((0.0, {"key": future.key, "worker": "a"}))
+    assert begun._late({future}) == {}
+    time.sleep(1.1)
+    assert begun._late({future})[future]["status"] == "timed out"
+    assert future.cancelled
+    assert client.restarted == ["a"]
 
 
 def sweep_command(path, out, *more):
@@ -200,6 +286,9 @@ def test_processes_solve_a_sweep(tmp_path, workers, each):
     assert [row["job"] for row in table(out)] == list(range(1, 2 * samples + 1))
     assert all(row["clamp_force_N"] > 0.0 for row in rows[:samples])
     assert (out / "report.html").stat().st_size > 10_000
+    written_at = {path: path.stat().st_mtime_ns for path in (out / "jobs").rglob("*.json")}
+    assert main([*command[3:], "--resume"]) == 0  # nothing is left to do
+    assert {path: path.stat().st_mtime_ns for path in (out / "jobs").rglob("*.json")} == written_at
 
 
 @pytest.mark.slow
@@ -210,6 +299,93 @@ def test_a_job_that_takes_too_long_is_ended(tmp_path):
     path = written(tmp_path, slow + "time_limit_s = 3\n" + RADII)
     rows = run_sweep(load_sweep(path), tmp_path / "out", Cluster(workers=2))
     assert [row["status"] for row in rows] == ["timed out", "timed out", "refused"]
+
+
+def python(*words):
+    """A process of dask's own command line."""
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen([sys.executable, "-m", *map(str, words)], env=environment, **quiet)
+
+
+@contextlib.contextmanager
+def cluster_at(port):
+    """A scheduler with one worker."""
+    address = f"tcp://127.0.0.1:{port}"
+    started = [
+        python("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"),
+        python("distributed.cli.dask_worker", address, "--nthreads", 1, "--no-dashboard"),
+    ]
+    try:
+        yield address
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.slow
+def test_two_sweeps_on_one_scheduler_have_their_own_answers(tmp_path):
+    running = []
+    with cluster_at(free_port()) as address:
+        for name, pressures in (("a", [10.0, 11.0]), ("b", [15.0, 16.0])):
+            path = tmp_path / f"{name}.toml"
+            path.write_text(f"{HEAD}[[vary]]\nkey = 'artery.pressure_kPa'\nvalues = {pressures}\n")
+            command, environment = sweep_command(path, tmp_path / name, "--scheduler", address, "--quiet")
+            running.append(subprocess.Popen(command, env=environment))
+        assert [process.wait(timeout=200) for process in running] == [0, 0]
+    for name in "ab":
+        for job in sorted((tmp_path / name / "jobs").iterdir()):
+            asked = json.loads((job / "job.json").read_text())["varied"]["artery.pressure_kPa"]
+            solved = json.loads((job / "result.json").read_text())["scene"]["artery"]["pressure_kPa"]
+            assert solved == asked
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("returns", [False, True])
+def test_a_scheduler_that_is_lost(tmp_path, returns):
+    """It is found again, or one sentence says so; what is done stays."""
+    path, out, port = written(tmp_path, HEAD + "samples = 20\n" + PRESSURES), tmp_path / "out", free_port()
+    with cluster_at(port) as address:
+        command, environment = sweep_command(path, out, "--scheduler", address, "--quiet")
+        running = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+        end = time.monotonic() + 100.0
+        while len(list(out.glob("jobs/0*"))) < 2 and time.monotonic() < end:
+            time.sleep(0.2)
+    with cluster_at(port) if returns else contextlib.nullcontext():
+        said = running.communicate(timeout=200)[1]
+    rows = table(out)
+    assert {row["status"] for row in rows} == {"done"}
+    if returns:
+        assert (running.returncode, len(rows), said) == (0, 20, "")
+    else:
+        assert running.returncode == 2
+        assert len(said.splitlines()) == 1
+        assert "is lost: go on with --resume" in said
+
+
+@pytest.mark.slow
+def test_two_processes_solve_more_than_one(tmp_path):
+    """Seconds of 40 jobs, without those of starting; a machine of two busy cores allows no sharp bound."""
+    path = written(tmp_path, HEAD + "samples = 40\n" + PRESSURES)
+    seconds = []
+    for workers in (1, 2):
+        times = []
+        run_sweep(
+            load_sweep(path),
+            tmp_path / str(workers),
+            Cluster(workers),
+            progress=lambda event, times=times: times.append(time.perf_counter()),
+        )
+        assert len(times) == 41
+        seconds.append(times[-1] - times[10])
+    assert seconds[1] < seconds[0], seconds
 
 
 @pytest.mark.slow
