@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from jaxclamp import EquilibriumError, Failure, Progress, by_value, clamp
+from jaxclamp import EquilibriumError, Failure, Progress, Scene, by_value, clamp
 from jaxclamp.scenes.files import loads_scene
 from jaxclamp.show.console import as_json
 from optimize.sweep_file import Job, Sweep
@@ -57,12 +57,12 @@ class Cluster:
     """address of a dask scheduler; None: this machine's own"""
 
 
-def solve_job(text: str) -> dict[str, Any]:
+def solve_job(scene: Scene) -> dict[str, Any]:
     """The record of a scene: status, failure, seconds and the content of result.json. A pure function."""
     begun = time.perf_counter()
     status, failure, result = DONE, None, None
     try:
-        result = clamp(loads_scene(text)).to_dict()
+        result = clamp(scene).to_dict()
     except EquilibriumError as error:
         status, failure = NOT_CONVERGED, str(error)
         result = None if error.result is None else error.result.to_dict()
@@ -212,7 +212,7 @@ class _Driver:
         while self.waiting and len(self.flying) < room:
             job = self.waiting.popleft()
             key = f"{self.name}-{job.number}-{next(self.serial)}"
-            task = by_value(_at_worker, job.text, self.name, key)
+            task = by_value(_at_worker, loads_scene(job.text or ""), self.name, key)  # with parts of its own
             self.flying[self.client.submit(task, key=key, pure=False)] = job
 
     def _answer(self, future: Any) -> dict[str, Any] | None:
@@ -289,10 +289,10 @@ class _Driver:
         self.tell(Progress("sweep", self.done / self.count, said))
 
 
-def _at_worker(text: str, topic: str, key: str) -> dict[str, Any]:
+def _at_worker(scene: Scene, topic: str, key: str) -> dict[str, Any]:
     """The same in a process of the cluster, with its address; says when it begins."""
     from distributed import get_worker
 
     worker = get_worker()
     worker.log_event(topic, {"key": key, "worker": worker.address})
-    return solve_job(text) | {"worker": worker.address}
+    return solve_job(scene) | {"worker": worker.address}

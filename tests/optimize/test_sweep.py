@@ -19,6 +19,7 @@ import pytest
 
 import jaxclamp as jc
 from jaxclamp.cli import main
+from jaxclamp.scenes.files import loads_scene
 from optimize import sweep as driver
 from optimize.sweep import Cluster, run_sweep, solve_job
 from optimize.sweep_file import load_sweep
@@ -192,7 +193,7 @@ def test_without_the_extra_one_sentence_says_what_to_install(tmp_path, monkeypat
 
 def test_a_job_has_the_answer_of_its_scene():
     scene = jc.load_scene("human-lad", COARSE)
-    record = solve_job(jc.dump_scene(scene))
+    record = solve_job(loads_scene(jc.dump_scene(scene)))
     assert record["status"] == "done"
     force = json.loads(record["result"])["final"]["clamp_force_N"]
     assert force == pytest.approx(jc.clamp(scene).final["clamp_force_N"], rel=1e-12)
@@ -289,6 +290,46 @@ def test_processes_solve_a_sweep(tmp_path, workers, each):
     written_at = {path: path.stat().st_mtime_ns for path in (out / "jobs").rglob("*.json")}
     assert main([*command[3:], "--resume"]) == 0  # nothing is left to do
     assert {path: path.stat().st_mtime_ns for path in (out / "jobs").rglob("*.json")} == written_at
+
+
+OWN = """
+import jax
+import jax.numpy as jnp
+import jaxclamp as jc
+
+@jc.record
+class Round(jc.Jaw):
+    shape: str = jc.static("round")
+    half_width: jax.Array = jc.quantity("mm", 0.0, 1e3, open_lower=True)
+    radius: jax.Array = jc.quantity("mm", 0.0, 1e3, open_lower=True)
+    sides: int = jc.static(2)
+
+    def gap(self, point):
+        return jnp.sqrt((point[1] - self.radius) ** 2 + point[2] ** 2) - self.radius
+
+    def half_extent(self):
+        return self.radius
+
+    def curvatures(self):
+        return jnp.reshape(1.0 / self.radius, 1)
+"""
+
+
+@pytest.mark.slow
+def test_parts_of_ones_own_go_to_the_processes(tmp_path):
+    own = tmp_path / "own.py"
+    own.write_text(OWN, encoding="utf-8")
+    jaw = "values = [{ jaw = { shape = 'round', half_width_mm = 1.0, radius_mm = 3.0 } }]"
+    path, out = written(tmp_path, f"{HEAD}[[vary]]\nkey = 'clamp'\n{jaw}\n"), tmp_path / "out"
+    command, environment = sweep_command(path, out, "--workers", "1", "--import", str(own))
+    subprocess.run(command, env=environment, capture_output=True, timeout=200, check=True)
+    assert [row["status"] for row in table(out)] == ["done"]
+    own.write_text(OWN + "# another\n", encoding="utf-8")
+    again = subprocess.run(
+        [*command, "--resume"], env=environment, capture_output=True, text=True, timeout=200, check=False
+    )
+    assert again.returncode == 2
+    assert "holds another sweep" in again.stderr
 
 
 @pytest.mark.slow
