@@ -252,8 +252,8 @@ def plot_limits(study: Study) -> Picture:
                     markersize=4,
                     label=label,
                 )
-        for bound, _ in c.sides:
-            axes.axvline(bound, color=THIRD, linewidth=1.2, label="bound")
+        for number, (bound, _) in enumerate(c.sides):
+            axes.axvline(bound, color=THIRD, linewidth=1.2, label="_" if number else "bound")
         for name, result in shown(study).items():
             pair = result.measure(c.measure), result.measure(study.problem.objective)
             axes.plot(*pair, "D", color=COLOURS[name], markersize=7, label=name)

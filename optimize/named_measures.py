@@ -103,10 +103,10 @@ def in_words(measure: Measure) -> str:
         return str(measure)
     numbers = [a for a in measure.arguments if isinstance(a, float)]
     layer = [f" of the {a}" for a in measure.arguments if isinstance(a, str)][-1:]
-    said = SAID_OF_NUMBERS.get(measure.name, " (onset stretch {:g})")
-    above = [said.format(a) for a in numbers]
-    before, behind = (above, []) if measure.name == jc.volume_above.__name__ else ([], above)
-    return "".join([measure.name.replace("_", " "), *before, *layer, *behind])
+    pattern = SAID_OF_NUMBERS.get(measure.name, " (onset stretch {:g})")
+    said = [pattern.format(a) for a in numbers]
+    of_layer = [*said, *layer] if measure.name == jc.volume_above.__name__ else [*layer, *said]
+    return "".join([measure.name.replace("_", " "), *of_layer])
 
 
 def read_measure(

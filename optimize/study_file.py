@@ -11,14 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxclamp import Failure, Measure, Progress, Scene, SceneError, load_scene
+from jaxclamp import Measure, Progress, Scene, SceneError, load_scene
 from jaxclamp.scenes.address import describe
-from jaxclamp.scenes.files import read_text
 from jaxclamp.scenes.schema import shown, toml_value
-from jaxclamp.scenes.toml import parsed
 from jaxclamp.scenes.wording import did_you_mean, shortened
 from optimize.drivers import METHODS
 from optimize.front import Front, front
+from optimize.keys import one_line, overrides, read_file, require_known, whole
 from optimize.named_measures import read_measure
 from optimize.numbers import MOST, number
 from optimize.problem import Constraint, DesignProblem, require_consistent
@@ -92,22 +91,11 @@ class StudyFile:
 
 def load_study(name_or_path: str | Path) -> StudyFile:
     """The study of a preset or a TOML file. Raises SceneError."""
-    text, source = read_text(name_or_path, "study")
-    try:
-        table = parsed(text)
-    except Failure as error:
-        raise SceneError(f"{source}: {error}") from None
-    try:
-        return _study(table, Path(name_or_path).parent)
-    except SceneError as error:
-        said = str(error)
-        raise SceneError(said if said.startswith(source) else f"{source}: {said}") from None
+    return read_file(name_or_path, "study", _study)
 
 
 def _study(table: dict[str, Any], folder: Path) -> StudyFile:
-    for key in table:
-        if key not in KEYS:
-            raise SceneError(f"unknown key {shortened(key)}; {did_you_mean(key, list(KEYS))}")
+    require_known(table, KEYS)
     reference, start = _scenes(table, folder)
     layers = tuple(layer.name for layer in start.artery.layers)
     objective, second = _objectives(table, layers)
@@ -126,14 +114,14 @@ def _study(table: dict[str, Any], folder: Path) -> StudyFile:
     )
     require_consistent(problem)
     return StudyFile(
-        title=_text(table, "title", "Jaw study"),
+        title=one_line(table, "title", "Jaw study"),
         problem=problem,
         method=_choice(table, "method", "slsqp", tuple(METHODS)),
-        max_evaluations=_whole(table, "max_evaluations", 40, 1, 10_000),
+        max_evaluations=whole(table, "max_evaluations", 40, 1, 10_000),
         tolerance=number(table.get("tolerance", 1e-4), "tolerance", 1e-12, 1.0),
-        starts=_whole(table, "starts", 1, 1, 100 if second is None else 1),
+        starts=whole(table, "starts", 1, 1, 100 if second is None else 1),
         second=second,
-        points=_whole(table, "points", 5, 2, 100),
+        points=whole(table, "points", 5, 2, 100),
     )
 
 
@@ -161,9 +149,7 @@ def _scenes(table: dict[str, Any], folder: Path) -> tuple[Scene, Scene]:
         raise SceneError(f"scene = {shown(name)}: expected a preset or a scene file")
     beside = folder / name
     scene: str | Path = beside if Path(name).suffix == ".toml" else name
-    changes = table.get("set", [])
-    if not isinstance(changes, list) or not all(isinstance(item, str) for item in changes):
-        raise SceneError('set: expected a list of overrides, such as ["mesh.axial=30"]')
+    changes = overrides(table)
     reference = _loaded(scene, changes)
     if "start" not in table:
         return reference, reference
@@ -234,22 +220,8 @@ def _constraints(item: Any, layers: tuple[str, ...], path: str) -> list[Constrai
     ]
 
 
-def _whole(table: dict[str, Any], key: str, default: int, least: int, most: int) -> int:
-    value = table.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise SceneError(f"{key} = {shown(value)}: expected a whole number from {least} to {most}")
-    return value
-
-
 def _choice(table: dict[str, Any], key: str, default: str, choices: tuple[str, ...]) -> str:
     value = table.get(key, default)
     if value not in choices:
         raise SceneError(f"{key} = {shown(value)}: expected one of {', '.join(choices)}")
     return str(value)
-
-
-def _text(table: dict[str, Any], key: str, default: str) -> str:
-    value = table.get(key, default)
-    if not isinstance(value, str) or not value.isprintable():
-        raise SceneError(f"{key} = {shown(value)}: expected a text on one line")
-    return value

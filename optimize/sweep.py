@@ -135,7 +135,6 @@ def connected(cluster: Cluster) -> Iterator[tuple[Any, str | None]]:
             yield client, cluster.scheduler
         return
     count = cluster.workers or os.cpu_count() or 1
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     with (
         LocalCluster(
             n_workers=count,

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxclamp import Failure, Scene, SceneError, dump_scene, load_scene, own_parts
+from jaxclamp import Scene, SceneError, dump_scene, load_scene, own_parts
 from jaxclamp.scenes.address import describe
-from jaxclamp.scenes.files import read_text
 from jaxclamp.scenes.schema import shown, toml_value
-from jaxclamp.scenes.toml import parsed
-from jaxclamp.scenes.wording import did_you_mean, shortened
+from jaxclamp.scenes.wording import shortened
+from optimize.keys import one_line, overrides, read_file, require_known, whole
 from optimize.numbers import MOST, number
 
 KEYS = (
@@ -87,27 +86,14 @@ class Sweep:
 
 def load_sweep(path: str | Path) -> Sweep:
     """The sweep of a TOML file. Raises SceneError; a scene that is refused is a job that says so."""
-    text, source = read_text(Path(path), "sweep")
-    try:
-        table = parsed(text)
-    except Failure as error:
-        raise SceneError(f"{source}: {error}") from None
-    try:
-        return _sweep(table, Path(path).parent)
-    except SceneError as error:
-        said = str(error)
-        raise SceneError(said if said.startswith(source) else f"{source}: {said}") from None
+    return read_file(Path(path), "sweep", _sweep)
 
 
 def _sweep(table: dict[str, Any], folder: Path) -> Sweep:
-    for key in table:
-        if key not in KEYS:
-            raise SceneError(f"unknown key {shortened(key)}; {did_you_mean(key, list(KEYS))}")
-    scene, fixed = table.get("scene"), table.get("set", [])
+    require_known(table, KEYS)
+    scene, fixed = table.get("scene"), overrides(table)
     if not isinstance(scene, str):
         raise SceneError(f"scene = {shown(scene)}: expected a preset or a scene file")
-    if not isinstance(fixed, list) or not all(isinstance(item, str) for item in fixed):
-        raise SceneError('set: expected a list of overrides, such as ["mesh.axial=30"]')
     fidelity = table.get("fidelity", "standard")
     base = load_scene(_beside(folder, scene), fixed, fidelity)  # refused here, if it is no job's fault
     jobs = []
@@ -117,11 +103,9 @@ def _sweep(table: dict[str, Any], folder: Path) -> Sweep:
         jobs.append(_job(place, name, _beside(folder, own_scene or scene), varied, fixed, fidelity))
     if not jobs:
         raise SceneError("nothing is varied: expected [[vary]] tables, or csv = a file of rows")
-    title = table.get("title", "Sweep")
-    if not isinstance(title, str) or not title.isprintable():
-        raise SceneError(f"title = {shown(title)}: expected a text on one line")
+    title = one_line(table, "title", "Sweep")
     limit = number(table.get("time_limit_s", 3600.0), "time_limit_s", 1.0, 1e7)
-    return Sweep(title, tuple(jobs), limit, _whole(table, "jobs_per_worker", 500))
+    return Sweep(title, tuple(jobs), limit, whole(table, "jobs_per_worker", 500, 1, MOST_JOBS))
 
 
 def _job(
@@ -196,7 +180,7 @@ def _samples(table: dict[str, Any], ranges: dict[str, tuple[float, float]]) -> l
         if "samples" in table:
             raise SceneError("samples: there are no ranges (lower and upper) to draw them from")
         return [{}]
-    count = _whole(table, "samples", None)
+    count = whole(table, "samples", None, 1, MOST_JOBS)
     seed = table.get("seed", 0)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise SceneError(f"seed = {shown(seed)}: expected a whole number from 0")
@@ -239,10 +223,3 @@ def _cell(text: str) -> float | str:
     except ValueError:
         return text
     return value if math.isfinite(value) else text
-
-
-def _whole(table: dict[str, Any], key: str, default: int | None) -> int:
-    value = table.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MOST_JOBS:
-        raise SceneError(f"{key} = {shown(value)}: expected a whole number from 1 to {MOST_JOBS}")
-    return value

@@ -146,14 +146,16 @@ def miss(
 ) -> str | None:
     """In a sentence, that the best design is beyond a bound by more than its error; None if it is not.
 
-    A bound that is relative to the reference is so on the same model.
+    A bound that is relative to the reference is so on the same model; it is not known if that was not solved.
     """
     value = best[c.measure]
     for side, sign in c.sides:
         bound = Estimate(side, dict.fromkeys(value.sources, 0.0))
-        if c.reference is not None:
-            if not reference or c.reference == 0.0:
-                continue
+        if c.reference:
+            if not reference:
+                return (
+                    f"there the bound of the {in_words(c.measure)} is not known: the reference was not solved"
+                )
             bound = _times(reference[c.measure], side / c.reference)
         left = value - bound
         if -sign * left.value > FEASIBLE * c.scale + (left.error or 0.0):

@@ -45,6 +45,8 @@ class Covariance:
     """of the scene, internal units, (n,)"""
     matrix: np.ndarray
     """their covariance, internal units, (n, n)"""
+    source: str
+    """where it comes from, as its file says"""
 
     @property
     def sd(self) -> np.ndarray:
@@ -85,6 +87,7 @@ class Uncertainty:
         """As in uncertainty.json; errors: those of the mesh, of the result."""
         return {
             "keys": list(self.covariance.keys),
+            "source": self.covariance.source,
             "wide": self.covariance.wide,
             "samples": self.samples,
             "figures": {
@@ -120,6 +123,9 @@ def _of_a_table(table: dict[str, Any], scene: Scene) -> Covariance:
     for key in table:
         if key not in KEYS:
             raise SceneError(f"unknown key {shown(key)}: expected {', '.join(KEYS)}")
+    source = table.get("source", "")
+    if not isinstance(source, str):
+        raise SceneError(f"source = {shown(source)}: expected a text")
     items = table.get("parameters")
     if not isinstance(items, list) or not items:
         raise SceneError("parameters: expected [[parameters]] tables with key, and sd or relative_sd")
@@ -143,7 +149,7 @@ def _of_a_table(table: dict[str, Any], scene: Scene) -> Covariance:
         raise SceneError(
             f"correlation: expected {len(keys)} rows of {len(keys)}, symmetric, with 1 in the diagonal"
         )
-    return _covariance(scene, keys, shares * np.outer(sds, sds))
+    return _covariance(scene, keys, shares * np.outer(sds, sds), source)
 
 
 def _of_a_fit(content: dict[str, Any], scene: Scene) -> Covariance:
@@ -154,7 +160,8 @@ def _of_a_fit(content: dict[str, Any], scene: Scene) -> Covariance:
     keys = list(content["parameters"])
     factors = [_place(scene, key).factor for key in keys]
     matrix = np.asarray(content["covariance"], float) * np.outer(factors, factors)
-    return _covariance(scene, keys, matrix)
+    files = ", ".join(map(str, content.get("files", ())))
+    return _covariance(scene, keys, matrix, f"a fit of {files}" if files else "a fit")
 
 
 def _place(scene: Scene, key: str) -> Any:
@@ -168,7 +175,7 @@ def _place(scene: Scene, key: str) -> Any:
     return place
 
 
-def _covariance(scene: Scene, keys: list[str], matrix: np.ndarray) -> Covariance:
+def _covariance(scene: Scene, keys: list[str], matrix: np.ndarray, source: str) -> Covariance:
     """With the numbers of the scene. Raises SceneError for what is no covariance."""
     if len(set(keys)) < len(keys):
         raise SceneError("a parameter is named twice")
@@ -179,7 +186,7 @@ def _covariance(scene: Scene, keys: list[str], matrix: np.ndarray) -> Covariance
         raise SceneError("the covariance is not positive: no numbers vary together like that")
     paths = [_place(scene, key).path for key in keys]
     values = np.array([float(get(scene, path)) for path in paths])
-    return Covariance(tuple(keys), tuple(paths), values, matrix)
+    return Covariance(tuple(keys), tuple(paths), values, matrix, source)
 
 
 # ---------------------------------------------------------------------------------- propagation

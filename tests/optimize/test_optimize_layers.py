@@ -21,6 +21,7 @@ LEVEL = {
     "journal": 0,
     "gains": 0,
     "numbers": 0,
+    "keys": 0,
     "named_measures": 1,
     "variables": 0,
     "problem": 1,

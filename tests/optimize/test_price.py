@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,9 +14,10 @@ import jaxclamp as jc
 from jaxclamp.cli import main
 from jaxclamp.pictures.fields import contact_along
 from jaxclamp.scenes.presets import presets as shipped
+from jaxclamp.show.console import as_json
 from optimize import Constraint, DesignProblem, Variable
 from optimize.evaluator import Evaluator
-from optimize.figures import labelled, plot_convergence, plot_profiles, profile
+from optimize.figures import labelled, limits, plot_convergence, plot_limits, plot_profiles, profile
 from optimize.gains import Gain
 from optimize.named_measures import in_words
 from optimize.price import BETTER, SAME, UNKNOWN, WORSE, Change, Compared, injuries
@@ -149,6 +151,7 @@ def test_measures_in_words():
     assert in_words(PEAK) == "smooth peak axial stress of the media"
     assert labelled(PEAK) == "Smooth peak axial stress of the media, kPa"
     assert in_words(jc.volume_above("media", 20.0)) == "volume above 20 kPa of the media"
+    assert in_words(jc.holding_force(0.05)) == "holding force at a friction of 0.05"
     assert in_words(jc.mean_damage("media", 1.26)) == "mean damage of the media (onset stretch 1.26)"
     assert in_words(jc.Measure("mine", "", lambda e: 0.0, ("a", 2.0))) == "mine(a, 2.0)"
 
@@ -159,6 +162,37 @@ def test_convergence_is_drawn_without_a_feasible_design():
     tried = [Evaluation(asked.start, np.array([v, 5.0]), np.zeros((2, 3)), 5) for v in (31.0, 30.0)]
     axes = plot_convergence(SimpleNamespace(problem=asked, evaluations=tried)).axes[0]
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["violates a constraint"]
+
+
+def test_the_record_of_a_face_that_falls_can_be_written():
+    """Its violation comes from the design, not from a measure, and decides what the best design is called."""
+    asked = problem(rising=True)
+    falling = Evaluation(np.array([0.6, 0.3, 0.9]), np.array([30.0]), np.zeros((1, 3)), 5)
+    content = json.loads(as_json(Record(asked, "slsqp", [falling]).to_dict()))
+    assert content["best_is_feasible"] is False
+    assert content["iterations"][0]["violation"] == pytest.approx(0.15)  # 0.3 of bounds that are 2 apart
+
+
+def test_the_objective_is_drawn_over_what_is_constrained(pair):
+    """One panel for each bound of the artery, none for one of the shape; designs by what they keep."""
+    asked = problem(Constraint(jc.jaw_curvature(), upper=1.0), Constraint(FORCE, 100.0, 200.0))
+    tried = [
+        Evaluation(asked.start, np.array([31.0, 0.5, force]), np.zeros((3, 3)), 5) for force in (150.0, 250.0)
+    ]
+    first, second = pair
+    study = SimpleNamespace(problem=asked, evaluations=tried, reference=None, start=first, best=second)
+    assert [place for place, _ in limits(study)] == [1]
+    (axes,) = plot_limits(study).axes
+    drawn = {line.get_label(): np.asarray(line.get_xydata()).tolist() for line in axes.lines}
+    assert drawn["feasible"] == [[150.0, 31.0]]
+    assert drawn["violates a constraint"] == [[250.0, 31.0]]
+    assert drawn["best"] == [[second.measure(FORCE), second.measure(PEAK)]]
+    assert [line.get_xdata()[0] for line in axes.lines if len(set(line.get_xdata())) == 1][2:4] == [
+        100.0,
+        200.0,
+    ]
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels.count("bound") == 1
 
 
 def with_jaw(jaw: str) -> SimpleNamespace:

@@ -145,7 +145,13 @@ def known(value, off):
         (Constraint(FORCE, upper=100.0, reference=100.0), (110.0, 4.0), (111.0, 3.0), None),
         # half of the reference's
         (Constraint(FORCE, upper=50.0, reference=100.0), (60.0, 2.0), (110.0, 2.0), "of 55 by 5 ± 1 mN"),
-        (Constraint(FORCE, upper=50.0, reference=100.0), (60.0, 2.0), None, None),
+        (
+            Constraint(FORCE, upper=50.0, reference=100.0),
+            (60.0, 2.0),
+            None,
+            "is not known: the reference was not",
+        ),
+        (Constraint(FORCE, upper=0.0, reference=0.0), (3.0, 2.0), None, "beyond its bound of 0 by 3 ± 2 mN"),
     ],
 )
 def test_a_bound_that_the_finer_model_does_not_keep_is_told(constraint, best, reference, said):

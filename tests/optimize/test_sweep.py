@@ -80,7 +80,7 @@ def test_rows_of_a_csv_file(tmp_path):
     [
         ("", "nothing is varied"),
         ("samples = 3\n" + RADII, "there are no ranges"),
-        (PRESSURES, "samples = None: expected a whole number"),
+        (PRESSURES, "samples is missing: expected a whole number"),
         (RADII + RADII, "it is varied already"),
         ("samples = 2\n" + PRESSURES.replace("16.0", "9.0"), "lower = 10 is not below upper = 9"),
         ("samples = 2\n" + PRESSURES.replace("pressure_kPa", "presure_kPa"), "pressure_kPa"),

@@ -69,13 +69,14 @@ def test_samples_agree_with_first_order(result, tmp_path):
 
 
 def test_what_is_written(result, tmp_path):
-    covariance = load_covariance(written(tmp_path, TABLES), result.scene)
+    covariance = load_covariance(written(tmp_path, 'source = "a cuff"\n' + TABLES), result.scene)
     found = sampled(uncertainty(result, covariance), result, 2)
     files = write_uncertainty(found, result, tmp_path)
     assert [file.name for file in files] == ["uncertainty.json", "tornado.png", "tornado.svg"]
     content = json.loads(files[0].read_text())
     assert content["figures"][FORCE]["sd"] == found.sd[FORCE]
     assert content["samples"] == 2
+    assert content["source"] == "a cuff"
     assert drawn(found) == [PEAK, FORCE, "axial_stress_at_P_kPa"]
     assert any(line.split()[0] == FORCE for line in lines(found, result)[2:])
 
@@ -105,6 +106,7 @@ def test_angles_are_in_degrees(result, tmp_path):
         ("correlation = [[1]]\n" + TABLES, "correlation: expected 2 rows of 2"),
         (TABLES.replace(P, C), "a parameter is named twice"),
         ("sds = 1\n" + TABLES, "unknown key"),
+        ("source = 1\n" + TABLES, "source = 1: expected a text"),
     ],
 )
 def test_a_wrong_file_is_one_sentence_and_exit_code_2(tmp_path, capsys, text, said):
